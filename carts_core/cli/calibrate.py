@@ -149,11 +149,8 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
         console.print(f"{camera}: focal length {focal:.0f} px, standard deviation {100 * deviation:.0f} %")
     for (arm, camera), more in result.missing.items():
         console.print(f"{arm} in {camera} is not calibrated: {more} more points are needed")
-    for arm, camera in result.ambiguous:
-        console.print(
-            f"{arm} in {camera}: another pose, beyond the standard deviations, can fit these points equally well. "
-            "Click the tip and the wrist joints in three or more frames."
-        )
+    for warning in result.warnings:
+        console.print(warning)
     for index in result.contradicting:
         point = points[index]
         where = f"{point.arm} {point.landmark} in frame {sequence.frame_ids[point.frame]}, camera {point.camera}"

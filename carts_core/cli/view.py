@@ -49,11 +49,10 @@ class View:
             from ..batch.folder import is_batch
         # Otherwise each garbage collection would scan all modules, which blocks the page for 0.2 s.
         gc.freeze()
-        segmenter = None
         if self.segmenter is not None:
-            from ..segmentation.onnx_segmenter import OnnxSegmenter
+            from ..segmentation.onnx_segmenter import check_files
 
-            segmenter = OnnxSegmenter.load(*self.segmenter)
+            check_files(*self.segmenter)
         options: dict[str, Any] = {
             "host": self.host,
             "port": self.port,
@@ -61,7 +60,7 @@ class View:
             "device": self.network.processor,
             "inference": self.network.inference,
             "weights": self.network.weights,
-            "segmenter": segmenter,
+            "segmenter": self.segmenter,
             "open_browser": self.open_browser,
         }
         if self.sequence is not None and not is_batch(self.sequence):

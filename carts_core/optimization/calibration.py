@@ -28,10 +28,9 @@ from ..settings import (
 from ..settings.stages import Descend
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
 from .hand_eye.files import STATIONARY_TOLERANCE
-from .hand_eye.result import PoseDeviation
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
-from .results import Progress, StopReason
+from .results import PoseDeviation, Progress, StopReason
 from .stages import Fit, Point, run_stages
 from .variables import DIFFERENCE_SPAN, Variables
 from .verdict import Assessment, Verdict, assess_calibration, check_domain, without_knowledge, worse_in

@@ -42,6 +42,29 @@ class Verdict(StrEnum):
         return cls.DOUBTFUL if probability >= POSSIBLE else cls.GOOD
 
 
+@dataclass(frozen=True)
+class PoseDeviation:
+    """Standard deviations of an arm's pose in a camera's frame, at the centroid of its points."""
+
+    rotation_deg: float
+    """Rotation in the worst direction [deg]."""
+    sideways_mm: float
+    """Translation perpendicular to the optical axis, in the worst direction [mm]."""
+    depth_mm: float
+    """Translation along the optical axis [mm]."""
+
+    @staticmethod
+    def of(covariance: Float[np.ndarray, "6 6"]) -> "PoseDeviation":
+        """Standard deviations from the covariance of rotation and translation in the camera's frame [rad, m]."""
+        parts = covariance[:3, :3], covariance[3:5, 3:5]
+        turn, sideways = (max(np.linalg.eigvalsh(part)[-1], 0.0) for part in parts)
+        return PoseDeviation(
+            rotation_deg=float(np.degrees(np.sqrt(turn))),
+            sideways_mm=float(1e3 * np.sqrt(sideways)),
+            depth_mm=float(1e3 * np.sqrt(max(covariance[5, 5], 0.0))),
+        )
+
+
 Observability = Literal["determined", "weak", "not visible"]
 
 _VISIBLE = 0.9

@@ -4,7 +4,7 @@ An ONNX file describes a computation and cannot execute code. PyTorch's `.pt` an
 Inputs and outputs are named as in the decoder export of Segment Anything and its successors.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ..errors import WeightsError
-from ..files.reading import WEIGHTS, read_bytes
+from ..files.reading import WEIGHTS, Kind, open_regular, read_bytes
 from ..onnx_runtime import inference_session
 from ..wording import shortened
 from .segmenter import Prompt
@@ -173,9 +173,20 @@ def _typed(value: np.ndarray, kind: str) -> np.ndarray:
     return np.ascontiguousarray(value, types[kind])
 
 
-def _session(path: Path) -> "InferenceSession":
+def check_files(encoder: Path, decoder: Path) -> None:
+    """Check that files exist and may be ONNX graphs, without loading them.
+
+    Raises:
+        WeightsError: a file is missing or a PyTorch file.
+    """
+    for path in (encoder, decoder):
+        _read(path, lambda path, kind: open_regular(path, kind).read(2))
+
+
+def _read(path: Path, read: Callable[[Path, Kind], bytes] = read_bytes) -> bytes:
+    """Content of a file."""
     try:
-        content = read_bytes(path, WEIGHTS)
+        content = read(path, WEIGHTS)
     except (OSError, ValueError) as error:
         raise WeightsError(f"segmenter file {path} cannot be read ({shortened(str(error))}). {_REMEDY}") from error
     if content[:2] == b"PK" or content[:1] == b"\x80":
@@ -183,8 +194,12 @@ def _session(path: Path) -> "InferenceSession":
             f"segmenter file {path} is a PyTorch file, which could execute code on loading. Export it as ONNX. "
             f"{_REMEDY}"
         )
+    return content
+
+
+def _session(path: Path) -> "InferenceSession":
     try:
-        return inference_session(content, fold=False)
+        return inference_session(_read(path), fold=False)
     except RuntimeError as error:
         raise WeightsError(
             f"segmenter file {path} is not an executable ONNX graph ({shortened(str(error), 300)}). {_REMEDY}"

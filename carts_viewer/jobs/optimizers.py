@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import UInt8
@@ -34,16 +34,12 @@ from carts_viewer.jobs.solver import (
     SequenceStep,
     SequenceTask,
     Smoothed,
-    Solver,
     Started,
     result_state,
 )
 from carts_viewer.jobs.solver_process import Reply, Requests, Run, SolverInProcess
 from carts_viewer.picture.strokes import Mask
 from carts_viewer.state import NETWORK, Pose, Target
-
-if TYPE_CHECKING:
-    from carts_core.networks import FeatureExtractor
 
 REPLY_WAIT = 1.0
 """Maximum time between checks for a reply, which wakes the worker [s]."""
@@ -105,8 +101,8 @@ class NetworkOptions(TypedDict, total=False):
     """PyTorch device of the networks, such as `cuda`; `cpu` by default."""
     inference: Inference
     """Runtime of the surface network; `auto` by default."""
-    segmenter: Segmenter | None
-    """Segmenter of the *Prompt* tool; the shipped network by default."""
+    segmenter: Segmenter | tuple[Path, Path] | None
+    """Segmenter of the *Prompt* tool, or its encoder and decoder as ONNX files; the shipped network by default."""
 
 
 class OptimizerFactory:
@@ -116,12 +112,13 @@ class OptimizerFactory:
         self, *, report: Callable[[str], None], requests: Requests | None = None, **options: Unpack[NetworkOptions]
     ) -> None:
         """`requests`: the solver; None for the solver in this process."""
-        self._segmenter = options.get("segmenter")
+        segmenter = options.get("segmenter")
+        files = segmenter if isinstance(segmenter, tuple) else None
+        self._segmenter = None if isinstance(segmenter, tuple) else segmenter
         self._choice = NetworkChoice(
-            options.get("weights", ()), None, options.get("device", "cpu"), options.get("inference", "auto")
+            options.get("weights", ()), None, options.get("device", "cpu"), options.get("inference", "auto"), files
         )
         self._requests: Requests = requests or SolverInProcess()
-        self._here: tuple[NetworkChoice, Solver] | None = None
         self.report = report
 
     def given_surface(self) -> bool:
@@ -141,16 +138,6 @@ class OptimizerFactory:
         if surface is not None and not is_surface(surface):
             raise WeightsError(f"{surface} contains no surface network. Adapt the network again.")
         self._choice = replace(self._choice, surface=surface)
-
-    def extractor(self) -> "FeatureExtractor":
-        """The networks in this process.
-
-        Raises:
-            WeightsError: the networks cannot be loaded.
-        """
-        if self._here is None or self._here[0] != self._choice:
-            self._here = self._choice, Solver(self._choice, self.report)
-        return self._here[1].extractor()
 
     @property
     def warm_up(self) -> tuple[Any, ...]:

@@ -4,7 +4,7 @@ Tasks and results contain NumPy arrays and can be sent to another process (`solv
 """
 
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,12 +16,14 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.model.scene import Scene, SceneState
 from carts_core.networks.header import is_surface
 from carts_core.optimization import FreeParameters, Iterate, SolverSettings, StopReason, SurfaceSolver
+from carts_core.optimization.results import PoseDeviation
 from carts_core.process import leave_a_core_free
 from carts_core.project import FitVerdict, IgnoreRegion
 from carts_core.project.values import VERDICTS
 from carts_core.recording import Sequence as Recording
 from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter
-from carts_core.settings import CALIBRATION_SETTINGS, SequenceSettings
+from carts_core.segmentation.onnx_segmenter import OnnxSegmenter
+from carts_core.settings import SequenceSettings
 from carts_core.settings.optimization import Inference
 from carts_core.settings.stages import NONE
 from carts_core.wording import duration_text
@@ -48,6 +50,8 @@ class NetworkChoice:
     """PyTorch device of the networks."""
     inference: Inference = "auto"
     """Runtime of the surface network."""
+    segmenter: tuple[Path, Path] | None = None
+    """Encoder and decoder of the segmenter, as ONNX files; None for the shipped one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +94,15 @@ class CalibrationTask:
     sequence: Recording
     indices: tuple[int, ...]
     domain: str
-    state: SceneState
-    """Initial state."""
+    start: "Calibration"
     free: FreeParameters
     target: Target
-    ignore: tuple[Masks, ...]
+    ignore: tuple[Masks, ...] | None = None
+    """Per frame, pixels that show an occluder."""
+    backgrounds: bool = True
+    """Whether the mean background of the recording is used."""
+    known_base_frames: Mapping[str, Float[np.ndarray, "6 6"]] = field(default_factory=dict)
+    """Arm -> covariance of its base frame, as in `HandEyeResult`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,26 +200,22 @@ class Smoothed:
     estimates: Mapping[int, Estimate]
 
 
-@dataclass(frozen=True)
-class CalibrationStep:
-    """An iterate of a calibration."""
-
-    index: int
-    text: str
-
-
-@dataclass(frozen=True)
-class Calibrated:
-    """Result of a calibration."""
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibrated values of the arms and cameras of a scene."""
 
     T_world_base: tuple[Float[np.ndarray, "4 4"], ...]
     T_camera_world: tuple[Float[np.ndarray, "4 4"], ...]
     intrinsics: tuple[tuple[float, float, float, float], ...]
-    changes: tuple[str, ...]
-    """Change of each unknown, as text for the user."""
-    moved: str
-    """Motions of the calibrated poses, as text for the user; empty if there are none."""
-    verdict: str
+
+    @staticmethod
+    def of(scene: Scene) -> "Calibration":
+        """Values of a scene."""
+        return Calibration(
+            tuple(arm.T_world_base for arm in scene.arms),
+            tuple(camera.T_camera_world for camera in scene.cameras),
+            tuple(camera.intrinsics for camera in scene.cameras),
+        )
 
     def applied_to(self, scene: Scene) -> Scene:
         """The scene with this calibration."""
@@ -221,6 +225,40 @@ class Calibrated:
             for camera, T, k in zip(scene.cameras, self.T_camera_world, self.intrinsics, strict=True)
         ]
         return replace(scene, arms=tuple(arms), cameras=tuple(cameras))
+
+
+@dataclass(frozen=True)
+class CalibrationStep:
+    """An iterate of a calibration."""
+
+    index: int
+    stage: int
+    stages: int
+    loss: float
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """Result of a calibration."""
+
+    calibration: Calibration
+    stop_reason: StopReason
+    loss_before: float
+    """Initial mean loss of the frames [1]."""
+    loss_after: float
+    deviations: Mapping[tuple[str, str], PoseDeviation]
+    """(arm, camera) -> standard deviations of the arm's pose relative to that camera."""
+    changes: tuple[str, ...]
+    """Change of each unknown, as text for the user."""
+    moved: str
+    """Motions of the calibrated poses, as text for the user; empty if there are none."""
+    beyond: str
+    """Warning about base frames that moved farther than their known covariance allows; empty if there are none."""
+    verdict: str
+    """good, doubtful or failed; empty if there is no verdict."""
+    reason: str
+    """Reason for the verdict, with a remedy."""
 
 
 _REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
@@ -258,9 +296,20 @@ class Solver:
             )
         return self._extractor
 
+    def segmenter(self) -> Segmenter:
+        """Load the segmenter, if it is not loaded yet."""
+        if self._segmenter is None:
+            files = self._choice.segmenter
+            own = None if files is None else OnnxSegmenter.load(*files)
+            self._segmenter = own or NetworkSegmenter.of(self.extractor())
+        return self._segmenter
+
     def prepare(self) -> str:
         """Load the networks; returns their fingerprint."""
-        return self.extractor().sha256
+        fingerprint = self.extractor().sha256
+        if self._choice.segmenter is not None:
+            self.segmenter()
+        return fingerprint
 
     @staticmethod
     def forget_images(sequence: Recording) -> None:
@@ -270,9 +319,7 @@ class Solver:
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
         """Mask of the object of a prompt."""
-        if self._segmenter is None:
-            self._segmenter = NetworkSegmenter.of(self.extractor())
-        return self._segmenter.segment(image, prompt)
+        return self.segmenter().segment(image, prompt)
 
     def run(self, task: FrameTask) -> Iterator[Started | Advanced | Ended]:
         """Optimize a frame; yields `Started`, the iterates, and `Ended`."""
@@ -325,21 +372,24 @@ class Solver:
 
     def calibration(self, task: CalibrationTask) -> Iterator[Started | CalibrationStep | Calibrated]:
         """Calibrate on frames; yields `Started`, the iterates, and `Calibrated`."""
-        sequence, scene = task.sequence, scene_at(task.sequence.scene, task.state)
+        from carts_core.evaluation.calibration import beyond_prior  # noqa: PLC0415
+
+        sequence, scene = task.sequence, task.start.applied_to(task.sequence.scene)
         cameras = [camera.name for camera in scene.cameras]
+        predictor = self._predictor(task.target)
+        yield Started(self._weights(task.target))
         optimizer = optimization.CalibrationOptimizer(
             scene,
             [sequence.frame(index, task.domain, cameras) for index in task.indices],
-            self._predictor(task.target),
+            predictor,
             free=replace(task.free, joints=False),
-            ignore=list(task.ignore),
-            backgrounds=optimization.Backgrounds.of(sequence, cameras, task.domain),
+            ignore=None if task.ignore is None else list(task.ignore),
+            backgrounds=optimization.Backgrounds.of(sequence, cameras, task.domain) if task.backgrounds else None,
+            known_base_frames=task.known_base_frames,
         )
-        yield Started(self._weights(task.target))
-        most = CALIBRATION_SETTINGS.iterations
-        while (iterate := optimizer.step()) is not None:
-            text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}; at most {most} iterations"
-            yield CalibrationStep(iterate.index, text)
+        for iterate in optimizer:
+            calibration = Calibration.of(iterate.scene)
+            yield CalibrationStep(iterate.index, iterate.stage, iterate.stages, iterate.loss, calibration)
         result = optimizer.result()
         units = {"deg": "°"}
         changes = [
@@ -348,12 +398,16 @@ class Solver:
         ]
         found = result.assessment
         yield Calibrated(
-            tuple(arm.T_world_base for arm in result.scene.arms),
-            tuple(camera.T_camera_world for camera in result.scene.cameras),
-            tuple(camera.intrinsics for camera in result.scene.cameras),
+            Calibration.of(result.scene),
+            result.stop_reason,
+            float(np.mean(result.frame_losses_before)),
+            float(np.mean(result.frame_losses_after)),
+            result.deviations,
             tuple(changes),
             _moved(scene, result.scene),
-            "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}".strip(),
+            beyond_prior(scene, result, task.known_base_frames) or "",
+            "" if found is None else found.verdict.value,
+            "" if found is None else f"{found.reason} {found.remedy}".strip(),
         )
 
     def sequence(self, task: SequenceTask) -> Generator[Started | SequenceStep | Smoothed | float | None, bool, None]:

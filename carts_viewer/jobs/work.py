@@ -31,7 +31,7 @@ from carts_core.stopping import PARENT
 from carts_viewer.actions.context import Context
 from carts_viewer.jobs.comparison import Comparison, Waiting
 from carts_viewer.jobs.optimizers import OptimizerFactory, provenance
-from carts_viewer.jobs.solver import Calibrated, CalibrationStep, CalibrationTask, Started, scene_at
+from carts_viewer.jobs.solver import Calibrated, Calibration, CalibrationStep, CalibrationTask, Started, scene_at
 
 _ACCEPTED, _OPTIMIZED = ReviewState.ACCEPTED, ReviewState.OPTIMIZED
 
@@ -99,7 +99,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     target, before = session.target(state.observed), session.editor.view
     measured = session.measured(state.frame)
     ignored = tuple(session.ignored(index, cameras, target) for index in indices)
-    task = CalibrationTask(sequence, tuple(indices), state.domain, measured, free, target, ignored)
+    scene = scene_at(session.scene, measured)
+    task = CalibrationTask(sequence, tuple(indices), state.domain, Calibration.of(scene), free, target, ignored)
     most, made_by, result = CALIBRATION_SETTINGS.iterations, None, None
     with closing(optimizers.calibration(task)) as steps:
         while (found := (yield from steps.next())) is not None:
@@ -107,14 +108,16 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
                 case Started():
                     made_by = provenance(found, cameras, CALIBRATION_SETTINGS, free, target)
                 case CalibrationStep():
-                    yield Progress(found.index, most, found.text, found.text)
+                    stage = f"Stage {found.stage + 1} of {found.stages}"
+                    text = f"{stage}, loss {found.loss:.4f}; at most {most} iterations"
+                    yield Progress(found.index, most, text, text)
                 case Calibrated():
                     result = found
     assert made_by is not None and result is not None
     for line in result.changes:
         yield Progress(most, most, "Comparing", line)
-    verdict, scene = result.verdict, scene_at(session.scene, measured)
-    edits = _calibration_edits(scene, result.applied_to(scene), made_by)
+    verdict = f"{result.verdict.capitalize()}: {result.reason}" if result.verdict else ""
+    edits = _calibration_edits(scene, result.calibration.applied_to(scene), made_by)
     if not edits:
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return

@@ -2,15 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from carts_core.errors import SettingsError
+from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.start.roots import MAX_ENTRIES, Entry, Roots
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.page import Page
-
-if TYPE_CHECKING:
-    from carts_core.networks import FeatureExtractor
 
 
 class SitePage(Protocol):
@@ -42,12 +40,9 @@ class Host(Protocol):
     def post(self, job: Callable[[], None]) -> None:
         """Queue a function for the site's thread. Thread-safe."""
 
-    def load_networks(self) -> "FeatureExtractor":
-        """Load the networks. Thread-safe.
-
-        Raises:
-            WeightsError: the networks cannot be loaded.
-        """
+    @property
+    def optimizers(self) -> OptimizerFactory:
+        """The solver, whose process is started by the first task and ends with the shown page."""
         ...
 
     def show_start(self, problem: str = "") -> None:

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import Unpack
 
 import viser
 
@@ -17,6 +17,7 @@ from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
 from carts_viewer.app import ServerOptions, ViewerApp
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
+from carts_viewer.jobs.solver_process import Requests, SolverProcess
 from carts_viewer.start.batch_page import BatchPage
 from carts_viewer.start.host import SitePage
 from carts_viewer.start.roots import Roots
@@ -25,9 +26,6 @@ from carts_viewer.transport.document import Document, render
 from carts_viewer.transport.events import Chosen, Clicked
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.wizard import RecordingWizard
-
-if TYPE_CHECKING:
-    from carts_core.networks import FeatureExtractor
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +50,7 @@ class Site:
         *,
         batch: Path | None = None,
         report: Callable[[str], None] = lambda line: None,
+        solver: Requests | None = None,
         **options: Unpack[ServerOptions],
     ) -> None:
         """Start serving the start page, or a batch.
@@ -60,6 +59,7 @@ class Site:
             folders: the allowed folders.
             batch: folder of the batch that is shown first.
             report: called with a line for the user about long operations.
+            solver: the solver, which remains after the site is closed; None for a process for each shown page.
             options: see `ServerOptions`.
 
         Raises:
@@ -74,6 +74,8 @@ class Site:
         )
         self.document = Document(self.page)
         self._report, self._options = report, options
+        self._solver = solver
+        self._own_solver: SolverProcess | None = None
         self.url = self.page.url
         self.app: ViewerApp | None = None
         self.storage_failure: str | None = None
@@ -118,10 +120,13 @@ class Site:
         finally:
             self.page.close()
 
-    def load_networks(self) -> "FeatureExtractor":
-        """Load the networks; see `Host.load_networks`."""
+    @property
+    def optimizers(self) -> OptimizerFactory:
+        """See `Host.optimizers`."""
         networks = {name: value for name, value in self._options.items() if name in NetworkOptions.__annotations__}
-        return OptimizerFactory(report=self._report, **networks).extractor()  # pyright: ignore[reportArgumentType]
+        self._own_solver = None if self._solver else self._own_solver or SolverProcess()
+        requests = self._solver or self._own_solver
+        return OptimizerFactory(report=self._report, requests=requests, **networks)  # pyright: ignore[reportArgumentType]
 
     def show_start(self, problem: str = "") -> None:
         """Show the start page."""
@@ -155,6 +160,7 @@ class Site:
                 report=self._report,
                 page=self.page,
                 folders=self.roots.folders,
+                solver=self._solver,
                 **self._options,
             )
         except CartsError as error:
@@ -206,6 +212,9 @@ class Site:
         app, self.app = self.app, None
         if page is not None:
             page.close()
+        if self._own_solver is not None:
+            self._own_solver.close()
+            self._own_solver = None
         if app is not None:
             try:
                 app.close()

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Rows
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,23 +12,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.evaluation.calibration import beyond_prior
 from carts_core.files import name_fault
 from carts_core.model.camera import rigid_transform
 from carts_core.model.scene import Scene
-from carts_core.networks import FeatureExtractor
-from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult
-from carts_core.optimization.hand_eye import (
-    HandEyePrior,
-    ImagePoint,
-    PointAgreement,
-    PoseDeviation,
-    agreement_with_points,
-)
-from carts_core.recording import Sequence, evenly_spaced
+from carts_core.optimization.hand_eye import ImagePoint, PointAgreement, PoseDeviation, agreement_with_points
 from carts_core.recording.importing.found import FoundRecording, Note
-from carts_core.settings import CALIBRATION
 from carts_core.wording import counted
+from carts_viewer.jobs.solver import Calibrated, CalibrationStep, Started
+from carts_viewer.jobs.solver_process import Run
 from carts_viewer.start.roots import Roots
 from carts_viewer.wizard.points import Clicking
 
@@ -45,7 +37,7 @@ class CalibrationProgress:
     """Completed share of the stages, in [0, 1]."""
     scene: Scene | None = None
     """The scene with the calibration so far."""
-    result: CalibrationResult | None = None
+    result: Calibrated | None = None
     """Result of a finished calibration."""
     error: str = ""
     """Cause of a failure; empty if there is none."""
@@ -57,28 +49,24 @@ STOPPED = CalibrationProgress("Stopped; the calibration from your points is unch
 
 
 class CalibrationJob:
-    """A calibration on a separate thread."""
+    """A calibration by the solver, followed on a separate thread."""
 
     def __init__(
         self,
-        sequence: Sequence,
+        steps: Run[Started | CalibrationStep | Calibrated],
         scene: Scene,
-        *,
-        known: HandEyePrior,
-        load_networks: Callable[[], FeatureExtractor],
         report: Callable[[CalibrationProgress], None],
     ) -> None:
-        """Start the calibration; `report` is called on its thread with every progress; the last one is `ended`."""
-        self._sequence, self._scene, self._known = sequence, scene, known
-        self._load_networks = load_networks
-        self._report = report
-        self._cancelled = threading.Event()
+        """Start a calibration of a scene; `report` is called on the thread with every progress; the last is `ended`."""
+        self._steps, self._scene, self._report = steps, scene, report
+        self._cancelled, self._woken = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="carts-calibration", daemon=True)
         self._thread.start()
 
     def cancel(self) -> None:
         """Request a stop, without a result."""
         self._cancelled.set()
+        self._woken.set()
 
     @property
     def cancelled(self) -> bool:
@@ -99,29 +87,28 @@ class CalibrationJob:
 
     def _calibrate(self) -> CalibrationProgress:
         self._report(CalibrationProgress("Loading the networks", 0.0))
-        extractor = self._load_networks()
-        self._report(CalibrationProgress("Reading images", 0.0))
-        frames = []
-        for index in evenly_spaced(len(self._sequence), CALIBRATION_FRAMES):
-            if self.cancelled:
-                return STOPPED
-            frames.append(self._sequence.frame(index))
-        fixed = [camera.name for camera in self._scene.cameras if camera.name not in self._known.free_cameras]
-        free = replace(CALIBRATION, locked_cameras=tuple(fixed))
-        optimizer = CalibrationOptimizer(
-            self._scene, frames, extractor, free=free, known_base_frames=self._known.base_covariances
-        )
-        last: CalibrationIterate | None = None
-        for iterate in optimizer:
-            if self.cancelled:
-                return STOPPED
-            last = iterate
-            text = f"Stage {iterate.stage + 1} of {iterate.stages}, step {iterate.index + 1}, loss {iterate.loss:.4f}"
-            self._report(CalibrationProgress(text, iterate.stage / iterate.stages, iterate.scene))
-        if last is None:
-            return CalibrationProgress("", 0.0, error="The calibration ended without a step.", ended=True)
-        result = optimizer.result()
-        return CalibrationProgress("Calibrated", 1.0, result.scene, result, ended=True)
+        with closing(self._steps):
+            while not self.cancelled:
+                match self._next():
+                    case Started():
+                        self._report(CalibrationProgress("Reading images", 0.0))
+                    case CalibrationStep() as step:
+                        text = f"Stage {step.stage + 1} of {step.stages}, step {step.index + 1}, loss {step.loss:.4f}"
+                        scene = step.calibration.applied_to(self._scene)
+                        self._report(CalibrationProgress(text, step.stage / step.stages, scene))
+                    case Calibrated() as result:
+                        scene = result.calibration.applied_to(self._scene)
+                        return CalibrationProgress("Calibrated", 1.0, scene, result, ended=True)
+        return STOPPED
+
+    def _next(self) -> Started | CalibrationStep | Calibrated | None:
+        """The next result; None once a stop was requested."""
+        reply = self._steps.next()
+        reply.on_done(self._woken.set)
+        while not (reply.done or self.cancelled):
+            self._woken.wait()
+            self._woken.clear()
+        return None if self.cancelled else reply.result()
 
 
 def as_plain(scene: Scene) -> dict[str, Any]:
@@ -170,22 +157,21 @@ class CalibrationReport:
     """Maximum RMS residual of the points that errors of clicks and measured joints explain [px]."""
 
 
-def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
+def report_of(result: Calibrated, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
     """Report of a calibration that started from the clicked points."""
     found = clicking.result
     assert found is not None
-    measured = clicking.sequence.measured
-    compared = agreement_with_points(result.scene, measured, points, found)
-    assessment = result.assessment
+    scene = result.calibration.applied_to(clicking.scene)
+    compared = agreement_with_points(scene, clicking.sequence.measured, points, found)
     before, after = (
         tuple(float(each) if np.isfinite(each) else None for each in row) for row in (compared.before, compared.after)
     )
     return CalibrationReport(
-        loss_before=float(np.mean(result.frame_losses_before)),
-        loss_after=float(np.mean(result.frame_losses_after)),
-        verdict="" if assessment is None else assessment.verdict.value,
-        reason="" if assessment is None else f"{assessment.reason} {assessment.remedy}".strip(),
-        poses=_poses(result, clicking, points),
+        loss_before=result.loss_before,
+        loss_after=result.loss_after,
+        verdict=result.verdict,
+        reason=result.reason,
+        poses=_poses(result, scene, clicking, points),
         before=before,
         after=after,
         disagreeing=compared.disagreeing,
@@ -194,9 +180,7 @@ def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImageP
     )
 
 
-def _objection(
-    result: CalibrationResult, compared: PointAgreement, clicking: Clicking, points: Rows[ImagePoint]
-) -> str:
+def _objection(result: Calibrated, compared: PointAgreement, clicking: Clicking, points: Rows[ImagePoint]) -> str:
     """Description of the contradiction between points and calibration; empty if they agree."""
     before, after, limits = compared.before, compared.after, compared.limits
     if compared.disagreeing and not compared.agrees:
@@ -213,12 +197,10 @@ def _objection(
             "All points together moved farther from the clicks than click noise explains: RMS "
             f"{compared.rms_before:.1f} to {compared.rms_after:.1f} px, with {compared.rms_limit:.1f} px allowed."
         )
-    assert clicking.result is not None
-    text = beyond_prior(clicking.scene, result, clicking.result.base_covariances)
-    return "" if text is None else text[0].upper() + text[1:]
+    return result.beyond[:1].upper() + result.beyond[1:]
 
 
-def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> tuple[PoseReport, ...]:
+def _poses(result: Calibrated, after: Scene, clicking: Clicking, points: Rows[ImagePoint]) -> tuple[PoseReport, ...]:
     """Change of the pose of each arm in each camera."""
     frames = sorted({point.frame for point in points})
     poses = []
@@ -226,8 +208,7 @@ def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoin
         arm = clicking.scene.arm(name)
         middle = arm.robot.forward_kinematics(clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
         old, new = (
-            scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base
-            for scene in (clicking.scene, result.scene)
+            scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base for scene in (clicking.scene, after)
         )
         turn = Rotation.from_matrix(new[:3, :3] @ old[:3, :3].T).magnitude()
         shift = np.linalg.norm((new - old)[:3] @ middle)

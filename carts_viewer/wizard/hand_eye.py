@@ -8,17 +8,20 @@ from pathlib import Path
 
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
-from carts_core.optimization import CalibrationResult, StopReason
-from carts_core.optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint
-from carts_core.recording import Sequence
+from carts_core.optimization import StopReason
+from carts_core.optimization.hand_eye import HandEyeResult, ImagePoint
+from carts_core.recording import Sequence, evenly_spaced
 from carts_core.recording.importing.delays import open_recording
 from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.writing import write_sequence
+from carts_core.settings import CALIBRATION
 from carts_core.wording import counted
+from carts_viewer.jobs.solver import Calibrated, Calibration, CalibrationTask
 from carts_viewer.picture import layers
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.start.host import Host
+from carts_viewer.state import NETWORK
 from carts_viewer.transport.document import render
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.calibration import (
@@ -130,7 +133,7 @@ def _rms(residuals: Rows[float | None], result: HandEyeResult) -> float:
 _WIDTH = 360.0
 """Width of the panel below the document [px]; the document is as wide as the panel (`static/document.js`)."""
 
-Calibrated = Callable[[Callable[[Draft], Draft]], None]
+ChangeDraft = Callable[[Callable[[Draft], Draft]], None]
 """Receives, on the site's thread, a function that changes the draft after a calibration."""
 
 
@@ -141,7 +144,7 @@ class HandEyeStep:
         problem: the last error; empty if there is none.
     """
 
-    def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Calibrated) -> None:
+    def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: ChangeDraft) -> None:
         """Open the recording; `CartsError` if it is not a valid sequence. `report` receives calibration results."""
         self._host, self._recording, self._report = host, recording, report
         self.problem = ""
@@ -324,17 +327,24 @@ class HandEyeStep:
         if self._clicking.result is None:
             raise SettingsError(self._clicking.problem or "Click points first.")
         self._progress = CalibrationProgress("Starting", 0.0)
+        scene, known = self._clicking.scene, self._clicking.result.base_covariances
+        unknown = unknown_cameras(self._sequence.scene)
+        fixed = tuple(camera.name for camera in scene.cameras if camera.name not in unknown)
+        task = CalibrationTask(
+            self._sequence,
+            tuple(evenly_spaced(len(self._sequence), CALIBRATION_FRAMES)),
+            self._sequence.domains[0],
+            Calibration.of(scene),
+            replace(CALIBRATION, locked_cameras=fixed),
+            NETWORK,
+            backgrounds=False,
+            known_base_frames=known,
+        )
 
         def report(progress: CalibrationProgress) -> None:
             self._host.post(lambda: self._proceed(progress))
 
-        self._job = CalibrationJob(
-            self._sequence,
-            self._clicking.result.scene,
-            known=HandEyePrior(self._clicking.result.base_covariances, unknown_cameras(self._sequence.scene)),
-            load_networks=self._host.load_networks,
-            report=report,
-        )
+        self._job = CalibrationJob(self._host.optimizers.calibration(task), scene, report)
 
     def _proceed(self, progress: CalibrationProgress) -> None:
         if self._job is not None and self._job.cancelled:
@@ -345,7 +355,7 @@ class HandEyeStep:
         self._progress = progress
         self._report(lambda draft: draft if progress.result is None else self._calibrated(draft, progress.result))
 
-    def _calibrated(self, draft: Draft, result: CalibrationResult) -> Draft:
+    def _calibrated(self, draft: Draft, result: Calibrated) -> Draft:
         """The draft with the result of a calibration: applied if it agrees with the clicked points, else offered."""
         report = report_of(result, self._clicking, draft.points)
         if result.stop_reason in (StopReason.FAILED, StopReason.START_KEPT):
@@ -353,7 +363,7 @@ class HandEyeStep:
             verdict = f" {report.verdict.capitalize()}: {report.reason}" if report.verdict else ""
             self._progress = CalibrationProgress("", 0.0, error=text + verdict, ended=True)
             return draft
-        self._progress, found = None, as_plain(result.scene)
+        self._progress, found = None, as_plain(result.calibration.applied_to(self._clicking.scene))
         draft = draft.uncalibrated(report=report)
         return replace(draft, offered=found) if report.objection else replace(draft, calibration=found)
 

@@ -1,5 +1,8 @@
 """Segmentation from clicks and boxes, by the shipped segmenter and by SAM-type ONNX models."""
 
+import json
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from carts_core.cli.view import View
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.evaluation.metrics import dice
 from carts_core.networks import FeatureExtractor
@@ -232,3 +236,50 @@ def test_other_models_are_refused_with_the_expected_inputs(model: tuple[Path, Pa
     text.write_text("no graph")
     with pytest.raises(WeightsError, match="not an executable ONNX graph"):
         OnnxSegmenter.load(text, decoder)
+
+
+_PROMPT = """
+import json, sys
+from pathlib import Path
+
+import numpy as np
+import carts_core.cli.command_line
+from carts_core.project import Key
+from carts_viewer.actions import intents
+from carts_viewer.app import ViewerApp
+from carts_viewer.picture.strokes import Stroke, Target
+
+path, encoder, decoder = map(Path, sys.argv[1:4])
+found = []
+for files in ((encoder, decoder), (decoder, encoder)):
+    with ViewerApp.open(path, port=0, segmenter=files) as app:
+        points = np.array([json.loads(sys.argv[4])])
+        app.queue.put(intents.Paint(7, Stroke(1, 0, "left", Target.IGNORE, False, False, 1, points, prompt=True)))
+        state = app.wait_until_shown()
+        region = state.project.get(Key.ignore_region(0, "left"))
+        found.append([state.error, None if region is None else region.region().tolist()])
+print(json.dumps([found, "torch" in sys.modules, "onnxruntime" in sys.modules]))
+"""
+
+
+def test_a_model_for_the_page_runs_in_the_solver_process(
+    model: tuple[Path, Path], tiny_sequence: Callable[..., Path]
+) -> None:
+    path = tiny_sequence()
+    image = Sequence.open(path).frame(0).images["left"]
+    v, u = np.unravel_index(cv2.blur(image, (9, 9)).sum(-1).argmax(), image.shape[:2])
+    place = float(u) + 0.5, float(v) + 0.5
+    command = [sys.executable, "-c", _PROMPT, str(path), *map(str, model), json.dumps(place)]
+    said = subprocess.check_output(command, text=True, timeout=120)
+    ((error, region), (refused, unchanged)), *imported = json.loads(said.splitlines()[-1])
+    wanted = OnnxSegmenter.load(*model).segment(image, Prompt(inside=(place,)))
+    assert error is None and wanted.any() and np.array_equal(region, wanted)
+    assert "an encoder has one input, an image" in refused and unchanged == region
+    assert imported == [False, False]
+
+
+def test_unreadable_files_are_refused_before_the_page_is_served(tmp_path: Path) -> None:
+    (tmp_path / "pickle.pth").write_bytes(b"\x80\x02")
+    for name, reason in (("pickle.pth", "is a PyTorch file"), ("none.onnx", "cannot be read")):
+        with pytest.raises(WeightsError, match=reason):
+            View(tmp_path / "sequence.toml", segmenter=(tmp_path / name, tmp_path / name)).run()

@@ -1,9 +1,14 @@
 """New recording without a browser: its form, delays, and calibrations that are stopped, kept or offered."""
 
+import json
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +20,7 @@ from swaying import write_log, write_swaying
 from visitor import write_lab_files
 from waiting import PATIENCE, eventually
 
+from carts_core import optimization
 from carts_core.imaging.working_image import Window
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
@@ -25,8 +31,9 @@ from carts_core.optimization import ImagePredictor, StopReason
 from carts_core.optimization.hand_eye import PoseDeviation
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
+from carts_viewer.jobs.solver_process import SolverInProcess
 from carts_viewer.start.site import Site
-from carts_viewer.wizard import calibration, hand_eye
+from carts_viewer.wizard import hand_eye
 from carts_viewer.wizard.calibration import CalibrationJob
 from carts_viewer.wizard.check import Guess, check_form, guess
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed
@@ -176,6 +183,7 @@ class OneStep:
             stop_reason=StopReason.CONVERGED,
             assessment=None,
             beyond=(),
+            unknowns=(),
             deviations={("PSM1", "left"): PoseDeviation(7.1, 8.2, 9.3)},
         )
 
@@ -190,7 +198,7 @@ def jobs(monkeypatch: pytest.MonkeyPatch) -> list[CalibrationJob]:
         return begun[-1]
 
     monkeypatch.setattr(hand_eye, "CalibrationJob", begin)
-    monkeypatch.setattr(calibration, "CalibrationOptimizer", OneStep)
+    monkeypatch.setattr(optimization, "CalibrationOptimizer", OneStep)
     return begun
 
 
@@ -218,7 +226,7 @@ def made(tiny_sequence: Callable[..., Path]) -> Sequence:
 def site(made: Sequence, tmp_path: Path) -> Iterator[Site]:
     """At the last step of New recording, with the points clicked."""
     root, key = open_calibration(tmp_path / "new", made, made.scene)
-    with Site([root], port=0) as opened:
+    with Site([root], port=0, solver=SolverInProcess()) as opened:
         opened.post(lambda: opened.show_recording(key))
         yield opened
 
@@ -251,7 +259,7 @@ def test_a_calibration_that_had_ended_before_it_was_stopped_is_not_taken_either(
     assert ended(site, "Calibrated").calibration is not None, "the next one is not stopped"
 
 
-@pytest.mark.parametrize("moment", ["images are read", "a step", "the result"])
+@pytest.mark.parametrize("moment", ["the start", "a step", "the result"])
 def test_a_calibration_is_stopped_at_any_moment(
     site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
@@ -263,14 +271,13 @@ def test_a_calibration_is_stopped_at_any_moment(
         eventually(lambda: "Stopping …" in site.document.content)
         eventually(lambda: jobs and jobs[-1].cancelled)
 
-    def evenly_spaced(count: int, _: int) -> Iterator[int]:
-        yield 0
-        pressed()
-        yield from range(1, count)
-
     class Stopped(OneStep):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            if moment == "the start":
+                pressed()
+
         def __iter__(self) -> Iterator[SimpleNamespace]:
-            assert moment != "images are read"
             yield from super().__iter__()
             if moment == "a step":
                 pressed()
@@ -281,11 +288,22 @@ def test_a_calibration_is_stopped_at_any_moment(
             pressed()
             return super().result()
 
-    if moment == "images are read":
-        monkeypatch.setattr(calibration, "evenly_spaced", evenly_spaced)
-    monkeypatch.setattr(calibration, "CalibrationOptimizer", Stopped)
+    monkeypatch.setattr(optimization, "CalibrationOptimizer", Stopped)
     site.post(lambda: place.choose(*CALIBRATE))
     assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None
+
+
+def test_few_points_are_called_ambiguous_until_a_calibration_is_kept(site: Site, jobs: list[CalibrationJob]) -> None:
+    place, text = place_of(site), "another pose, beyond the standard deviations, can fit these points equally well."
+    assert text not in site.document.content
+    for _ in range(4):
+        row = next(row for row, point in enumerate(place.draft.points) if point.landmark.startswith("wrist"))
+        site.post(lambda row=row: place.choose("remove-point", str(row)))
+        site.wait()
+    assert f"PSM1 in left: {text} Click the tip and the wrist joints" in site.document.content
+    site.post(lambda: place.choose(*CALIBRATE))
+    ended(site, "Calibrated")
+    assert text not in site.document.content
 
 
 def test_a_calibration_that_points_agree_with_is_kept_with_its_figures(site: Site, jobs: list[CalibrationJob]) -> None:
@@ -316,7 +334,7 @@ def test_a_calibration_that_moves_within_the_errors_of_points_and_joints_says_wh
             arms = tuple(replace(arm, T_world_base=shift @ arm.T_world_base) for arm in scene.arms)
             super().__init__(replace(scene, arms=arms))
 
-    monkeypatch.setattr(calibration, "CalibrationOptimizer", Moved)
+    monkeypatch.setattr(optimization, "CalibrationOptimizer", Moved)
     place = place_of(site)
     site.post(lambda: place.choose(*CALIBRATE))
     report = ended(site, "The calibration fits the images of many frames").report
@@ -339,7 +357,7 @@ def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
                 replace(scene, arms=tuple(replace(a, T_world_base=turn @ a.T_world_base) for a in scene.arms))
             )
 
-    monkeypatch.setattr(calibration, "CalibrationOptimizer", Moved)
+    monkeypatch.setattr(optimization, "CalibrationOptimizer", Moved)
     place = place_of(site)
     site.post(lambda: place.choose(*CALIBRATE))
     offer = ended(site, "Calibration not kept")
@@ -357,11 +375,54 @@ def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
         assert ("Keep anyway" in site.document.content) is (text == "Calibration not kept")
 
 
+_CALIBRATE = """
+import json, sys, time
+from pathlib import Path
+
+import carts_core.cli.command_line
+from carts_viewer.start.site import Site
+
+RUNS = 'aria-label="Calibration"'
+with Site([Path(sys.argv[1])], port=0) as site:
+    site.post(lambda: site.show_recording(sys.argv[2]))
+    site.wait()
+    page = site.shown
+    for choice in ("back", "continue", "calibrate"):
+        site.post(lambda choice=choice: page.choose(choice, ""))
+    site.wait()
+    assert RUNS in site.document.content
+    while RUNS in site.document.content:
+        time.sleep(0.1)
+    print(json.dumps([page.draft.to_json(), site.document.content, "torch" in sys.modules]))
+"""
+
+
+def test_a_calibration_of_the_solver_process_equals_one_in_this_process_and_needs_no_torch(
+    made: Sequence, tmp_path: Path
+) -> None:
+    root, key = open_calibration(tmp_path / "new", made, made.scene)
+    images = root / "day" / "left"
+    shutil.rmtree(images)
+    shutil.copytree(made.path.parent / "regular" / "left", images)
+    here = DraftFile()
+    here.write(DraftFile(key).read())
+    command = [sys.executable, "-c", _CALIBRATE, str(root), key]
+    said = subprocess.check_output(command, text=True, timeout=300)
+    there, content, torch_imported = json.loads(said.splitlines()[-1])
+    with Site([root], port=0, solver=SolverInProcess()) as site:
+        site.post(lambda: site.show_recording(here.key))
+        place = place_of(site)
+        site.post(lambda: place.choose(*CALIBRATE))
+        eventually(lambda: "Loss" in site.document.content, timeout=300)
+        assert there == place.draft.to_json() and place.draft.calibration is not None
+    assert "Calibrated" in content and not torch_imported
+
+
 class Truths(ImagePredictor):
     """Predicts the true surface map of one of three frames: the red, the green or the blue one."""
 
     device = torch.device("cpu")
-    stride = 16
+    stride, sha256 = 16, "0" * 64
 
     def __init__(self, made: Sequence) -> None:
         renderer = Renderer(made.scene, width=640, height=480)
@@ -384,7 +445,7 @@ def test_a_calibration_by_true_maps_is_kept_where_clicked_points_agree(
     seen = replace(made.scene, arms=(replace(arm, T_world_base=turn @ arm.T_world_base),))
     root, key = open_calibration(tmp_path / "new", made, seen)
     monkeypatch.setattr(FeatureExtractor, "load", lambda *_, **__: Truths(made))
-    with Site([root], port=0) as site:
+    with Site([root], port=0, solver=SolverInProcess()) as site:
         site.post(lambda: site.show_recording(key))
         place = place_of(site)
         site.post(lambda: place.choose(*CALIBRATE))

@@ -15,6 +15,7 @@ from ...errors import SettingsError
 from ...model.keypoints import LandmarkKind
 from ...model.scene import Scene
 from ...settings import SurfaceSolver
+from ..results import PoseDeviation
 from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, transform_point, views_of
 
 _OUTLIER = 4.0
@@ -23,30 +24,6 @@ _FEW_POINTS = 6
 """Number of points of an arm below which several poses can fit equally well."""
 _SINGULAR = 1e-12
 """Eigenvalue of the scaled curvature below which a direction is undetermined [1]."""
-_TURN, _SIDEWAYS = slice(0, 3), slice(3, 5)
-"""Indices of rotation and lateral translation in a camera's frame."""
-
-
-@dataclass(frozen=True)
-class PoseDeviation:
-    """Standard deviations of an arm's pose in a camera's frame, at the centroid of its points."""
-
-    rotation_deg: float
-    """Rotation in the worst direction [deg]."""
-    sideways_mm: float
-    """Translation perpendicular to the optical axis, in the worst direction [mm]."""
-    depth_mm: float
-    """Translation along the optical axis [mm]."""
-
-    @staticmethod
-    def of(covariance: Float[np.ndarray, "6 6"]) -> "PoseDeviation":
-        """Standard deviations from the covariance of rotation and translation in the camera's frame [rad, m]."""
-        turn, sideways = (max(np.linalg.eigvalsh(covariance[part, part])[-1], 0.0) for part in (_TURN, _SIDEWAYS))
-        return PoseDeviation(
-            rotation_deg=float(np.degrees(np.sqrt(turn))),
-            sideways_mm=float(1e3 * np.sqrt(sideways)),
-            depth_mm=float(1e3 * np.sqrt(max(covariance[5, 5], 0.0))),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +50,15 @@ class HandEyeResult:
     ambiguous: tuple[tuple[str, str], ...] = ()
     """(arm, camera) of base frames from so few points, or points of so few landmarks, that another pose can fit
     equally well."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about ambiguous base frames, as text for the user."""
+        return tuple(
+            f"{arm} in {camera}: another pose, beyond the standard deviations, can fit these points equally well. "
+            "Click the tip and the wrist joints in three or more frames."
+            for arm, camera in self.ambiguous
+        )
 
     @property
     def error(self) -> float:
