@@ -1,8 +1,9 @@
-"""Functions for both NumPy arrays and PyTorch tensors. PyTorch is imported only if tensors are used."""
+"""Functions for both NumPy arrays and PyTorch tensors, and of poses. PyTorch is imported only if tensors are used."""
 
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 Array = Any
 """A NumPy array or a PyTorch tensor."""
@@ -27,3 +28,14 @@ def converted(values: np.ndarray, like: Array) -> Array:
     if isinstance(like, np.ndarray):
         return values.astype(like.dtype, copy=False)
     return library(like).from_numpy(values).to(like)
+
+
+def pose_distance(
+    before: Float[np.ndarray, "*batch 4 4"], after: Float[np.ndarray, "*batch 4 4"]
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    """Rotation angles [deg] and translation distances [mm] between poses."""
+    turned = after[..., :3, :3] @ np.swapaxes(before[..., :3, :3], -1, -2)
+    # The chord length is accurate for small angles, unlike the arc cosine of the trace.
+    chord = np.linalg.norm(turned - np.eye(3), axis=(-2, -1))
+    angle = 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
+    return np.rad2deg(angle), 1000.0 * np.linalg.norm(after[..., :3, 3] - before[..., :3, 3], axis=-1)

@@ -4,16 +4,18 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from html import escape
+from itertools import starmap
+from typing import TYPE_CHECKING, NamedTuple
 
 from .console import in_markdown
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """Cell of a table."""
 
     text: str
@@ -30,12 +32,22 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
 
+    @property
+    def body(self) -> "Markup":
+        """Rows as escaped HTML; a template takes several times as long, which matters for 10,000 rows."""
+        from markupsafe import Markup  # noqa: PLC0415
+
+        def cell(text: str, note: str) -> str:
+            return f"<td>{escape(text)}<small>{escape(note)}</small></td>" if note else f"<td>{escape(text)}</td>"
+
+        return Markup("\n".join([f"<tr>{''.join(starmap(cell, row))}</tr>" for row in self.rows]))
+
     @staticmethod
     def of(title: str, caption: str, rows: Sequence[Mapping[str, str | Cell]]) -> "Table | None":
         """Table whose headings are the keys of its rows; None without rows."""
         if not rows:
             return None
-        cells = (tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row.values()) for row in rows)
+        cells = [tuple([cell if isinstance(cell, Cell) else Cell(cell) for cell in row.values()]) for row in rows]
         return Table(title, caption, tuple(rows[0]), tuple(cells))
 
 

@@ -43,6 +43,11 @@ def tune_process() -> None:
     keep_memory()
 
 
+def processor_time() -> float:
+    """Processor time of this process and of its children that have ended [s]."""
+    return sum(os.times()[:4])
+
+
 def leave_a_core_free() -> None:
     """Limit torch to one thread less than the number of cores, four at most, unless `OMP_NUM_THREADS` is set.
 

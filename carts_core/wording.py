@@ -15,8 +15,10 @@ def counted(number: int, what: str) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Rounded duration, such as "40 s" or "3 min"."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    """Rounded duration, such as "40 s", "3 min" or "26.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def listed(names: Iterable[str], most: int = 40) -> str:

@@ -27,6 +27,11 @@ class Outcome:
     """`known`: done earlier; `busy`: run by another process."""
     error: str = ""
     seconds: float = 0.0
+    """Duration [s]."""
+    processor: float = 0.0
+    """Processor time [s]."""
+    frames: int = 0
+    """Number of frames with a verdict."""
 
 
 Work = Callable[[Job], Outcome]
@@ -54,10 +59,14 @@ class _Worker:
 
 
 class Pool:
-    """Pool of worker processes with `threads` threads each; `work` must be importable by name."""
+    """Pool of worker processes with `threads` threads each; `work` must be importable by name.
+
+    Attributes:
+        workers: number of parallel jobs.
+    """
 
     def __init__(self, work: Work, workers: int, threads: int) -> None:
-        self._work, self._workers, self._threads = work, workers, threads
+        self._work, self.workers, self._threads = work, workers, threads
         self._context = multiprocessing.get_context("spawn")
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
@@ -66,7 +75,7 @@ class Pool:
         workers: list[_Worker] = []
         try:
             while waiting or any(worker.job for worker in workers):
-                missing = min(self._workers, len(waiting) + sum(worker.job is not None for worker in workers))
+                missing = min(self.workers, len(waiting) + sum(worker.job is not None for worker in workers))
                 workers += [self._started() for _ in range(missing - len(workers))]
                 for worker in workers:
                     if worker.job is None and waiting:
@@ -160,10 +169,13 @@ class Cluster:
         scheduler: address such as `tcp://10.0.0.1:8786`, or `local` for workers on this machine.
         workers: number of local workers.
         threads: number of threads per worker.
+
+    Attributes:
+        workers: number of parallel jobs; that of a running scheduler is known once `run` has begun.
     """
 
     def __init__(self, work: Work, scheduler: str, workers: int, threads: int) -> None:
-        self._work, self._scheduler, self._workers, self._threads = work, scheduler, workers, threads
+        self._work, self._scheduler, self.workers, self._threads = work, scheduler, workers, threads
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Run all jobs; yields outcomes in order of completion. `SettingsError` if the scheduler does not respond."""
@@ -181,7 +193,7 @@ class Cluster:
         with ExitStack() as held:
             address = self._scheduler
             if address == LOCAL:
-                options = {"n_workers": self._workers, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+                options = {"n_workers": self.workers, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
                 address = held.enter_context(LocalCluster(**options)).scheduler_address  # pyright: ignore
             try:
                 client = held.enter_context(Client(address, timeout="10s"))
@@ -190,6 +202,7 @@ class Cluster:
                     f"--scheduler {self._scheduler}: the scheduler does not respond ({error}). Start it with `dask "
                     "scheduler`, and workers with `dask worker ADDRESS --nthreads 1`, or use `local`."
                 ) from error
+            self.workers = sum(client.nthreads().values()) or self.workers  # pyright: ignore
             futures = {client.submit(self._work, job, key=f"carts-{job.name}", pure=False): job for job in jobs}
             for future in as_completed(futures):
                 job = futures[future]

@@ -1,31 +1,41 @@
-"""Folder of a batch: states and results of its jobs, a summary, and projects for the review of jobs."""
+"""Folder of a batch: states and results of its jobs, a summary, and the list of jobs."""
 
 import json
 import os
 import socket
+import stat
 import threading
 import time
-from array import array
-from collections.abc import Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Rows
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from itertools import accumulate, chain
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import cv2
 import msgspec
 import numpy as np
 
-from ..errors import CartsError, SettingsError
-from ..export import KinematicsRow, outlined, read_kinematics_csv
-from ..export.kinematics import joint_columns, joint_units, position_values, std_values
-from ..files import BusyError, OutputPath, check_name, holds_file, locked_folder, set_aside, write_bytes, write_text
-from ..files.reading import IMAGE, TABLE, VALUES, read_bytes, typed_json
+from ..errors import OutputError, SettingsError
+from ..files import (
+    BusyError,
+    OutputPath,
+    check_name,
+    holds_file,
+    indented_json,
+    locked_folder,
+    open_below,
+    opened_folder,
+    resolved_paths,
+    set_aside,
+    try_lock,
+    write_bytes,
+    write_text,
+)
+from ..files.reading import VALUES, read_bytes, typed_json
 from ..package_imports import gc_paused
-from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
-from ..provenance import Record, fingerprint, read_records
-from ..recording import Sequence
 from .manifest import Job
 
 JOB_FILE = "job.json"
@@ -43,6 +53,8 @@ class StepState:
     """Fingerprint of the step's inputs; the step runs again after a change."""
     seconds: float
     """Duration [s]."""
+    processor: float | None = None
+    """Processor time [s]; None if it was not measured."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +63,7 @@ class JobState:
 
     status: Status = "waiting"
     steps: Mapping[str, StepState] = field(default_factory=dict)
-    """Finished steps."""
+    """Finished steps; `findings` is the summary of their results."""
     attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
     """Number of starts since the job last finished or failed; more than 1 if a worker was lost."""
     error: str = ""
@@ -65,8 +77,12 @@ class JobState:
 
 def read_state(folder: OutputPath) -> JobState:
     """State of the job in a folder; `failed` if its file is damaged."""
+    return _state(lambda: _read(folder))
+
+
+def _state(read: Callable[[], JobState]) -> JobState:
     try:
-        return _read(folder)
+        return read()
     except (OSError, ValueError) as error:
         remedy = "Run the batch again: the job is restarted, and the damaged file is kept."
         return JobState("failed", error=f"{JOB_FILE} cannot be read: {error}. {remedy}")
@@ -83,16 +99,6 @@ def _read(folder: OutputPath) -> JobState:
 def write_state(folder: OutputPath, state: JobState) -> None:
     """Replace the state of a job."""
     write_text(folder / JOB_FILE, json.dumps(asdict(state), indent=1))
-
-
-def present_status(folder: OutputPath) -> tuple[str, JobState]:
-    """Current status and state of a job; the status is `lost` if the job is marked as running but no process holds its
-    lock."""
-    state = read_state(folder)
-    if state.status == "running":
-        with suppress(BusyError), locked_folder(folder):
-            return "lost", state
-    return state.status, state
 
 
 class RunningJob:
@@ -145,10 +151,6 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
 
 
 FINDINGS_FILE = "findings.json"
-_WORST = 3
-"""Number of worst frames of a job with preview images."""
-_WIDTH = 480
-"""Maximum width of preview images [px]."""
 
 
 @dataclass(frozen=True)
@@ -185,77 +187,20 @@ def read_findings(folder: OutputPath) -> Findings | None:
     """Read the results of the job in a folder; None if it has not finished. `OSError` or `ValueError` if the file is
     damaged."""
     path = folder / FINDINGS_FILE
-    if not holds_file(path):
-        return None
-    found = typed_json(read_bytes(path.path, VALUES), Findings)
+    return _findings(read_bytes(path.path, VALUES)) if holds_file(path) else None
+
+
+def _findings(content: bytes) -> Findings:
+    found = typed_json(content, Findings)
     if any(len(rows) != 4 or {len(row) for row in rows} != {4} for rows in found.base_frames.values()):
         raise ValueError("a base frame is not a 4 x 4 matrix")
     return found
-
-
-def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
-    """Write `findings.json` of a finished job, and preview images of its worst frames."""
-    sequence = Sequence.open(sequence_file)
-    scene, found = sequence.scene, Findings(str(job.recording))
-    for arm in scene.arms:
-        for camera in scene.cameras:
-            T_mount_world = sequence.mounts(0).get(camera.name)
-            moved = np.eye(4) if T_mount_world is None else T_mount_world
-            seen_in = camera.name if T_mount_world is None else f"the first frame of {camera.name}"
-            found.base_frames[f"{arm.name} in {seen_in}"] = (camera.T_camera_world @ moved @ arm.T_world_base).tolist()
-    for table in kinematics_tables(folder, job):
-        rows = read_kinematics_csv(table, scene)
-        _add_corrections(found, sequence, rows)
-        cameras = table.parent.name
-        records = read_records(table.parent / "results.json")
-        frames = [
-            FrameFinding(cameras, row.frame_id, record.verdict, record.reason, record.probability or 0.0)
-            for row in rows
-            if (record := records.get(row.frame_id)) and record.verdict
-        ]
-        found.frames.extend(_pictured(folder, sequence, table.parent, frames))
-    write_text(folder / FINDINGS_FILE, json.dumps(asdict(found)))
 
 
 def kinematics_tables(folder: OutputPath, job: Job) -> list[Path]:
     """Tables of a job's corrected joints, one per domain and group of cameras; empty without optimization."""
     steps = [step for step in ("sequence", "optimize") if step in job.steps]
     return sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
-
-
-def _add_corrections(found: Findings, sequence: Sequence, rows: list[KinematicsRow]) -> None:
-    scene = sequence.scene
-    order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
-    units = [np.rad2deg(1.0) if unit == "rad" else 1000.0 for unit in joint_units(scene)]
-    for row in rows:
-        index = order[row.frame_id]
-        measured = np.concatenate([sequence.measured[arm.name][index] for arm in scene.arms])
-        change, deviation = position_values(scene, row) - measured, std_values(scene, row)
-        for name, unit, moved, std in zip(joint_columns(scene), units, change, deviation, strict=True):
-            found.corrections.setdefault(name, []).append(round(float(moved * unit), 6))
-            if np.isfinite(std):
-                found.deviations.setdefault(name, []).append(round(float(std * unit), 6))
-
-
-def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[FrameFinding]) -> Iterator[FrameFinding]:
-    """Yield the frames, with preview images of the worst frames that show the outline of the mask."""
-    worst = sorted(frames, key=lambda frame: -frame.probability)[:_WORST]
-    domain, first = part.parent.name, part.name.split("+")[0]
-    masks = part / "masks" / first if "+" in part.name else part / "masks"
-    for frame in frames:
-        if frame not in worst:
-            yield frame
-            continue
-        index = list(sequence.frame_ids).index(frame.frame)
-        image = sequence.frame(index, domain, [first]).images[first]
-        mask = cv2.imdecode(np.frombuffer(read_bytes(masks / f"{frame.frame}.png", IMAGE), np.uint8), 0)
-        assert mask is not None
-        shown = outlined(image, mask > 0)
-        scale = min(1.0, _WIDTH / shown.shape[1])
-        small = cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        name = f"worst-{part.name}-{frame.frame}.jpg"
-        write_bytes(folder / name, cv2.imencode(".jpg", small[..., ::-1])[1].tobytes())
-        yield replace(frame, picture=name)
 
 
 BATCH_FILE = "batch.json"
@@ -268,18 +213,35 @@ _ENDED = ("failed", "stopped", "done")
 
 
 @dataclass(frozen=True)
+class Results:
+    """Summary of the results of a job."""
+
+    verdicts: Mapping[str, int]
+    """Verdict -> number of frames."""
+    pictured: tuple[FrameFinding, ...]
+    """Worst frames, which have preview images."""
+    base_frames: Mapping[str, list[list[float]]]
+    """As in `Findings`."""
+
+    @property
+    def frames(self) -> int:
+        """Number of frames with a verdict."""
+        return sum(self.verdicts.values())
+
+
+@dataclass(frozen=True)
 class KnownJob:
-    """Job with its state and results."""
+    """Job with its state and a summary of its results."""
 
     job: Job
     status: str
     """One of `ORDER`."""
     state: JobState
-    findings: Findings | None
+    results: Results | None = None
     damage: str = ""
     """Reason why the results cannot be read."""
     written: tuple[int, ...] = ()
-    """Times [ns] and sizes [bytes] of the files of state and results."""
+    """Inodes, times [ns] and sizes [bytes] of the files of state and results."""
 
     @property
     def error(self) -> str:
@@ -288,51 +250,95 @@ class KnownJob:
         return lines[-1][:_MAX_ERROR_LENGTH] if lines else self.damage
 
 
-JointErrors = dict[str, tuple[array, array]]
-"""`ARM.JOINT` -> corrections and deviations of all jobs, as in `Findings`."""
+class JointErrors:
+    """Corrections and deviations of the joints of all jobs, as in `Findings`."""
+
+    def __init__(self) -> None:
+        self._jobs: list[tuple[tuple[str, ...], list[int], np.ndarray]] = []
+        """For each job, names of joints, numbers of their corrections and deviations, and these values."""
+
+    def add(self, found: Findings) -> None:
+        """Add the values of a job."""
+        names = tuple(found.corrections)
+        lists = [*found.corrections.values(), *(found.deviations.get(name, []) for name in names)]
+        self._jobs.append((names, list(map(len, lists)), np.array([*chain.from_iterable(lists)], dtype=float)))
+
+    def values(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """`ARM.JOINT` -> corrections and deviations [deg, mm], in the order of the jobs."""
+        found: defaultdict[str, tuple[list[np.ndarray], list[np.ndarray]]] = defaultdict(lambda: ([], []))
+        for names, lengths, values in self._jobs:
+            parts = [values[end - length : end] for end, length in zip(accumulate(lengths), lengths, strict=True)]
+            for number, name in enumerate(names):
+                corrections, deviations = found[name]
+                corrections.append(parts[number])
+                deviations.append(parts[number + len(names)])
+        return {name: (np.concatenate(each[0]), np.concatenate(each[1])) for name, each in found.items()}
 
 
 def known_jobs(
     batch: OutputPath, jobs: Rows[Job], before: Rows[KnownJob] = (), joints: JointErrors | None = None
 ) -> list[KnownJob]:
-    """States and results of jobs, in the given order, without corrections and deviations of joints.
+    """States and results of jobs, in the given order.
 
     Args:
         before: earlier result; its jobs are kept if their files have not changed.
         joints: to which corrections and deviations are added, except those of kept jobs.
     """
-    folder, earlier = batch / "jobs", {entry.job.name: entry for entry in before if entry.status in _ENDED}
-    with gc_paused():
-        return [_known(folder, job, earlier.get(job.name), {} if joints is None else joints) for job in jobs]
-
-
-def _known(jobs: OutputPath, job: Job, before: KnownJob | None, joints: JointErrors) -> KnownJob:
-    place = os.path.join(jobs.path, job.name)
-    if not os.path.isdir(place):
-        return KnownJob(job, "waiting", JobState(), None)
-    written: list[int] = []
-    for name in (JOB_FILE, FINDINGS_FILE):
-        with suppress(OSError):
-            found = os.lstat(os.path.join(place, name))
-            written += [found.st_mtime_ns, found.st_size]
-    if before is not None and before.written == tuple(written):
-        return before
-    folder = jobs / job.name
-    status, state = present_status(folder)
+    earlier = {entry.job.name: entry for entry in before if entry.status in _ENDED}
     try:
-        found = read_findings(folder)
-        if found is not None:
-            for name, values in found.corrections.items():
-                corrections, deviations = joints.setdefault(name, (array("d"), array("d")))
-                corrections.extend(values)
-                deviations.extend(found.deviations.get(name, []))
-            found = replace(found, corrections={}, deviations={})
-        return KnownJob(job, status, state, found, written=tuple(written))
+        with opened_folder(batch / "jobs") as folder, gc_paused():
+            return [_known(folder, job, earlier.get(job.name), joints) for job in jobs]
+    except (OSError, OutputError):
+        return [KnownJob(job, "waiting", JobState()) for job in jobs]
+
+
+def _known(jobs: int, job: Job, before: KnownJob | None, joints: JointErrors | None) -> KnownJob:
+    """State and results of a job in the open folder of all jobs; links in it are not followed."""
+    written = _written(jobs, f"{job.name}/{JOB_FILE}"), _written(jobs, f"{job.name}/{FINDINGS_FILE}")
+    if before is not None and before.written == written[0] + written[1]:
+        return before
+    try:
+        folder = open_below(jobs, job.name)
+    except OSError:
+        return KnownJob(job, "waiting", JobState())
+    try:
+        state = _state(lambda: typed_json(read_bytes(JOB_FILE, VALUES, folder), JobState)) if written[0] else JobState()
+        lost = state.status == "running" and _is_free(folder)
+        results, damage = _results(folder, joints) if written[1] else (None, "")
+    finally:
+        os.close(folder)
+    return KnownJob(job, "lost" if lost else state.status, state, results, damage, written[0] + written[1])
+
+
+def _results(folder: int, joints: JointErrors | None) -> tuple[Results | None, str]:
+    """Summary of the results in the open folder of a job, and the reason if they cannot be read; corrections and
+    deviations are added to `joints`."""
+    try:
+        found = _findings(read_bytes(FINDINGS_FILE, VALUES, folder))
     except (OSError, ValueError) as error:
-        damage = (
-            f"{FINDINGS_FILE} cannot be read: {str(error)[:_MAX_ERROR_LENGTH]}. Run the batch again to recreate it."
-        )
-        return KnownJob(job, status, state, None, damage, tuple(written))
+        why = str(error)[:_MAX_ERROR_LENGTH]
+        return None, f"{FINDINGS_FILE} cannot be read: {why}. Run the batch again to recreate it."
+    if joints is not None:
+        joints.add(found)
+    verdicts = Counter([frame.verdict for frame in found.frames])
+    return Results(verdicts, tuple([frame for frame in found.frames if frame.picture]), found.base_frames), ""
+
+
+def _written(folder: int, name: str) -> tuple[int, ...]:
+    """Inode, time [ns] and size [bytes] of a file in an open folder; empty if it is not a regular file."""
+    try:
+        found = os.stat(name, dir_fd=folder, follow_symlinks=False)
+    except OSError:
+        return ()
+    return (found.st_ino, found.st_mtime_ns, found.st_size) if stat.S_ISREG(found.st_mode) else ()
+
+
+def _is_free(folder: int) -> bool:
+    """Whether no process holds the lock of a job, given by its open folder."""
+    try:
+        return try_lock(folder)
+    except OSError:  # The file system does not support locks.
+        return False
 
 
 def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
@@ -350,10 +356,11 @@ class _Batch:
 
 def write_jobs(batch: OutputPath, jobs: Rows[Job]) -> None:
     """Write the list of jobs, for readers without the manifest."""
-    rows = [{**asdict(job), "recording": str(job.recording.resolve())} for job in jobs]
-    for row in rows:
-        del row["options"]
-    write_text(batch / BATCH_FILE, json.dumps({"format": "carts-batch-jobs/1", "jobs": rows}, indent=1))
+    rows = [
+        {"name": job.name, "recording": recording, "camera": job.camera, "domain": job.domain, "steps": job.steps}
+        for job, recording in zip(jobs, resolved_paths(job.recording for job in jobs), strict=True)
+    ]
+    write_bytes(batch / BATCH_FILE, indented_json({"format": "carts-batch-jobs/1", "jobs": rows}))
 
 
 def is_batch(folder: Path) -> bool:
@@ -375,58 +382,3 @@ def read_jobs(folder: Path) -> list[Job]:
             f"{folder} is not a readable batch: {error}. Give the output folder of carts batch."
         ) from error
     return jobs
-
-
-_MADE = {"calibrate": "calibration", "import": "recording"}
-"""Step -> folder with its sequence file; the results of a job refer to the first of these files that exists."""
-
-
-def sequence_file(folder: OutputPath, job: Job) -> Path:
-    """Sequence file to which a job's results refer."""
-    made = [folder / name / "sequence.toml" for step, name in _MADE.items() if step in job.steps]
-    return next((path.path for path in made if holds_file(path)), job.recording)
-
-
-def review_project(folder: OutputPath, job: Job) -> Path:
-    """Project for the review of a job, created if missing. New results have a new project; old projects are kept.
-
-    Raises:
-        CartsError: a table of results cannot be read.
-    """
-    tables = kinematics_tables(folder, job)
-    try:
-        digest = fingerprint(*(read_bytes(table, TABLE) for table in tables))
-    except OSError as error:
-        raise CartsError(f"results of {job.name} cannot be read ({error}). Run the job again.") from error
-    path = (folder / f"review-{digest[:12]}.carts").path
-    if not path.exists():
-        project = Project.open(sequence := Sequence.open(sequence_file(folder, job)), path)
-        try:
-            edits = {key: value for table in tables for key, value in _edits(sequence, table)}
-            project.apply(f"Results of {job.name}", edits)
-        finally:
-            project.close()
-    return path
-
-
-def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:
-    """Edits with the corrected joints and the verdict of each frame of a table."""
-    order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
-    try:
-        records = read_records(table.parent / "results.json")
-        for row in read_kinematics_csv(table, sequence.scene):
-            if row.source != "measured":
-                yield from _of_frame(sequence, order[row.frame_id], row, records[row.frame_id])
-    except (OSError, ValueError, KeyError) as error:
-        raise CartsError(f"{table.parent} holds no readable results: {error!r}. Run the batch again.") from error
-
-
-def _of_frame(sequence: Sequence, index: int, row: KinematicsRow, record: Record) -> Iterator[tuple[Key[Any], Any]]:
-    made_by = Provenance.made_by_optimizer({"batch": dict(record.origin)}, record.origin["weights"])
-    for arm in sequence.scene.arms:
-        positions = tuple(map(float, row.joint_positions[arm.name]))
-        std = None if row.joint_std is None else np.asarray(row.joint_std.get(arm.name, np.nan), float)
-        known = None if std is None or not np.isfinite(std).any() else tuple(std.tolist())
-        yield Key.joints(index, arm.name), JointCorrection(positions, made_by, known)
-    if record.verdict:
-        yield Key.verdict(index), FitVerdict(record.verdict, record.reason, "", record.probability or 0.0)

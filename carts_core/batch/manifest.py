@@ -1,6 +1,7 @@
 """Manifest of a batch: a TOML file with recordings, cameras, domains and steps."""
 
 import glob
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..errors import SettingsError
-from ..files import unique_file_names
+from ..files import resolved_paths, unique_file_names
 from ..files.reading import SETTINGS, parse_toml, read_text
 from ..wording import listed, shown
 
@@ -63,7 +64,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
         job for number, table in enumerate(tables, 1) for job in _jobs(path, output, f"{path}, jobs {number}", table)
     ]
     names = unique_file_names([job.name for job in found])
-    return [replace(job, name=name) for name, job in zip(names, found, strict=True)]
+    return [job if job.name == name else replace(job, name=name) for name, job in zip(names, found, strict=True)]
 
 
 def _jobs(manifest: Path, output: Path | None, where: str, table: dict[str, Any]) -> Iterator[Job]:
@@ -109,7 +110,11 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
     for pattern in patterns:
         matched = sorted(glob.glob(str(folder / pattern), recursive=True))
         if output is not None and glob.has_magic(pattern):
-            matched = [path for path in matched if not Path(path).resolve().is_relative_to(output.resolve())]
+            made = f"{output.resolve()}{os.sep}"
+            real = resolved_paths(matched)
+            matched = [
+                path for path, place in zip(matched, real, strict=True) if not f"{place}{os.sep}".startswith(made)
+            ]
         if not matched:
             raise SettingsError(f"{where}: recording {pattern!r} matches no file in {folder}. Correct or remove it.")
         found += map(Path, matched)

@@ -1,55 +1,64 @@
 """Report on all jobs as an HTML page with plots and the worst frames, and as JSON."""
 
-import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 
+from ..arrays import pose_distance
 from ..errors import CartsError
-from ..evaluation.calibration import pose_distance
-from ..files import OutputPath, output_stream, write_bytes, write_text
+from ..files import OutputPath, indented_json, write_bytes, write_text
 from ..files.reading import IMAGE, read_bytes
 from ..html import Table, render_page
+from ..package_imports import gc_paused
+from ..wording import counted, duration_text
+from .cost import Cost
 from .folder import ORDER, JointErrors, KnownJob, known_jobs, most_urgent_first
 from .manifest import Job
-
-matplotlib.use("Agg")
-matplotlib.rcParams["text.parse_math"] = False
 
 _SHOWN = 24
 """Maximum number of worst frames on the page."""
 _VERDICTS = ("good", "doubtful", "failed")
+_TICKS = 8
+"""Maximum number of intervals between the labels of a plot's axis."""
 
 
 def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Path:
     """Write `report/report.html`, `report/report.json` and images; returns the page's path."""
-    joints: JointErrors = {}
-    folder, known = batch / "report", known_jobs(batch, jobs, joints=joints)
-    drifts = _drifts(known)
-    page = render_page(
-        "batch.html",
-        title=title,
-        sections={
-            "Jobs": _job_table(known),
-            "Verdicts": _verdict_table(known),
-            "Worst frames": _worst(batch, folder, known),
-            "Base frames": _drift_table(drifts),
-            "Joints": _joint_table(joints),
-        },
-        plot=_joint_figure(folder, joints),
-    )
-    document = {
-        "format": "carts-batch-report/1",
-        "jobs": {entry.job.name: {"status": entry.status, "error": entry.state.error} for entry in known},
-        "verdicts": {entry.job.name: _verdicts(entry) for entry in known},
-        "base_frames": drifts,
-        "joints": {name: _statistics(*values) for name, values in joints.items()},
-    }
-    write_text(folder / "report.json", json.dumps(document, indent=1))
+    errors = JointErrors()
+    folder, known = batch / "report", known_jobs(batch, jobs, joints=errors)
+    with gc_paused():
+        drifts, joints, cost = _drifts(known), errors.values(), Cost.of(known)
+        statistics = {name: _statistics(*values) for name, values in joints.items()}
+        page = render_page(
+            "batch.html",
+            title=title,
+            sections={
+                "Jobs": _job_table(known),
+                "Verdicts": _verdict_table(known),
+                "Worst frames": _worst(batch, folder, known),
+                "Base frames": _drift_table(drifts),
+                "Joints": _joint_table(statistics),
+                "Cost": _cost_table(cost),
+            },
+            plot=BoxPlot.of({name: corrections for name, (corrections, _) in joints.items()}),
+        )
+        document = {
+            "format": "carts-batch-report/1",
+            "jobs": {entry.job.name: {"status": entry.status, "error": entry.state.error} for entry in known},
+            "verdicts": {entry.job.name: _verdicts(entry) for entry in known},
+            "base_frames": drifts,
+            "joints": statistics,
+            "cost": {
+                "frames": cost.frames,
+                "core_hours": cost.core_hours,
+                "all_core_hours": cost.all_core_hours,
+                "workers": cost.estimates(),
+            },
+        }
+        write_bytes(folder / "report.json", indented_json(document))
     write_text(folder / "report.html", page)
     return (folder / "report.html").path
 
@@ -74,8 +83,7 @@ def _job_table(known: Sequence[KnownJob]) -> Table | None:
 
 
 def _verdicts(entry: KnownJob) -> dict[str, int]:
-    counts = Counter(frame.verdict for frame in (entry.findings.frames if entry.findings else ()))
-    return {verdict: counts[verdict] for verdict in _VERDICTS}
+    return {verdict: entry.results.verdicts.get(verdict, 0) if entry.results else 0 for verdict in _VERDICTS}
 
 
 def _verdict_table(known: Sequence[KnownJob]) -> Table | None:
@@ -99,12 +107,7 @@ def _verdict_table(known: Sequence[KnownJob]) -> Table | None:
 
 def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> list[tuple[str, str]]:
     """Captions and images of the frames with the largest probability of a wrong mask, copied into the report."""
-    frames = [
-        (entry.job, frame)
-        for entry in known
-        for frame in (entry.findings.frames if entry.findings else ())
-        if frame.picture
-    ]
+    frames = [(entry.job, frame) for entry in known for frame in (entry.results.pictured if entry.results else ())]
     frames.sort(key=lambda pair: -pair[1].probability)
     shown = []
     for number, (job, frame) in enumerate(frames[:_SHOWN], 1):
@@ -124,13 +127,22 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> 
 
 def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
     """Change of each base frame since the previous job with this base frame, in the order of the manifest."""
-    found, before = [], {}
+    found: list[dict[str, object]] = [
+        {"base_frame": name, "job": entry.job.name}
+        for entry in known
+        for name in (entry.results.base_frames if entry.results else ())
+    ]
+    poses: dict[str, list[list[list[float]]]] = {}
     for entry in known:
-        for name, rows in (entry.findings.base_frames if entry.findings else {}).items():
-            present = np.array(rows)
-            angle, distance = pose_distance(before.get(name, present), present)
-            found.append({"base_frame": name, "job": entry.job.name, "rotation_deg": angle, "translation_mm": distance})
-            before[name] = present
+        for name, rows in (entry.results.base_frames if entry.results else {}).items():
+            poses.setdefault(name, []).append(rows)
+    changes = {}
+    for name, rows in poses.items():
+        Ts = np.array(rows, dtype=float)
+        angles, distances = pose_distance(np.concatenate([Ts[:1], Ts[:-1]]), Ts)
+        changes[name] = iter(zip(angles.tolist(), distances.tolist(), strict=True))
+    for row in found:
+        row["rotation_deg"], row["translation_mm"] = next(changes[str(row["base_frame"])])
     return found
 
 
@@ -150,19 +162,19 @@ def _drift_table(drifts: list[dict[str, object]]) -> Table | None:
     )
 
 
-def _statistics(corrections: Sequence[float], deviations: Sequence[float]) -> dict[str, float | int | None]:
-    values = np.asarray(corrections)
+def _statistics(corrections: np.ndarray, deviations: np.ndarray) -> dict[str, float | int | None]:
+    sizes = np.abs(corrections)
     return {
-        "frames": len(values),
-        "mean": float(values.mean()),
-        "deviation": float(values.std()),
-        "median_size": float(np.median(np.abs(values))),
-        "largest_size": float(np.abs(values).max()),
+        "frames": len(corrections),
+        "mean": float(corrections.mean()),
+        "deviation": float(corrections.std()),
+        "median_size": float(np.median(sizes)),
+        "largest_size": float(sizes.max()),
         "median_reported": float(np.median(deviations)) if len(deviations) else None,
     }
 
 
-def _joint_table(joints: JointErrors) -> Table | None:
+def _joint_table(statistics: Mapping[str, Mapping[str, float | int | None]]) -> Table | None:
     headings = {
         "mean": "mean",
         "deviation": "standard deviation",
@@ -171,8 +183,7 @@ def _joint_table(joints: JointErrors) -> Table | None:
         "median_reported": "median reported standard deviation",
     }
     rows = []
-    for name, values in joints.items():
-        found = _statistics(*values)
+    for name, found in statistics.items():
         texts = {key: "–" if (number := found[key]) is None else f"{number:.3f}" for key in headings}
         rows.append(
             {"joint": name, "frames": str(found["frames"]), **{headings[key]: text for key, text in texts.items()}}
@@ -181,17 +192,74 @@ def _joint_table(joints: JointErrors) -> Table | None:
     return Table.of("Error of measured joints", caption, rows)
 
 
-def _joint_figure(folder: OutputPath, joints: JointErrors) -> tuple[str, str] | None:
-    """Draw the plot of corrections and standard deviations; returns its caption and file."""
-    if not joints:
-        return None
-    figure = Figure(figsize=(max(5.0, 1.5 + 0.5 * len(joints)), 5.0), layout="constrained")
-    axes = figure.subplots()
-    axes.boxplot([corrections for corrections, _ in joints.values()], widths=0.6, showfliers=False)
-    axes.set_xticks(range(1, len(joints) + 1), list(joints), fontsize=8, rotation=90)
-    axes.axhline(0.0, color="gray", linewidth=0.8)
-    axes.set_ylabel("corrected minus measured [deg, mm]")
-    axes.grid(axis="y", alpha=0.3)
-    with output_stream(folder / "joints.png") as stream:
-        figure.savefig(stream, format="png", dpi=110)
-    return "Corrections of each joint: median, quartiles, and whiskers at 1.5 interquartile ranges.", "joints.png"
+def _cost_table(cost: Cost) -> Table | None:
+    hours = "–" if cost.core_hours is None else f"{cost.core_hours:.3g}"
+    estimated = "" if cost.all_core_hours is None or not cost.waiting else f" ({cost.all_core_hours:.3g} for all jobs)"
+    caption = (
+        f"{counted(cost.frames, 'frame')} of {counted(len(cost.done), 'finished job')}, {hours} core hours{estimated}. "
+        "Estimates assume that the other jobs take as long as the finished jobs on average, and that the speed of a "
+        "worker does not depend on the number of workers."
+    )
+
+    def duration(seconds: float | int | None) -> str:
+        return "–" if seconds is None else duration_text(seconds)
+
+    return Table.of(
+        "Time for other numbers of workers",
+        caption,
+        [
+            {
+                "workers": str(row["workers"]),
+                "frames/s": "–" if (rate := row["frames_per_second"]) is None else f"{rate:.3g}",
+                "all jobs": duration(row["all_seconds"]),
+                "remaining jobs": duration(row["remaining_seconds"]),
+            }
+            for row in cost.estimates()
+        ],
+    )
+
+
+@dataclass(frozen=True)
+class BoxPlot:
+    """Box plot of the corrections of each joint, drawn by the page's template.
+
+    All values are heights relative to the plot, from 0 at its top to 1 at its bottom.
+    """
+
+    boxes: dict[str, tuple[float, float, float, float, float]]
+    """Joint -> upper whisker, upper quartile, median, lower quartile and lower whisker."""
+    ticks: list[tuple[str, float]]
+    """Labels [deg, mm] and heights of the axis."""
+
+    @staticmethod
+    def of(joints: Mapping[str, np.ndarray]) -> "BoxPlot | None":
+        """Plot of each joint's values [deg, mm]; None without joints."""
+        boxes = {name: _box(values) for name, values in joints.items() if len(values)}
+        if not boxes:
+            return None
+        lowest, highest = min(0.0, *(box[-1] for box in boxes.values())), max(0.0, *(box[0] for box in boxes.values()))
+        size = max(highest - lowest, 1e-6)
+        rough = size / _TICKS
+        step = next(
+            step for step in (unit * 10.0 ** np.floor(np.log10(rough)) for unit in (1, 2, 5, 10)) if step >= rough
+        )
+        top = highest + 0.05 * size
+        marks = step * np.arange(np.ceil(lowest / step), np.floor(highest / step) + 1)
+
+        def height(value: float) -> float:
+            return round((top - value) / (1.1 * size), 4)
+
+        digits = max(0, -int(np.floor(np.log10(step))))
+        return BoxPlot(
+            {name: tuple(map(height, box)) for name, box in boxes.items()},  # pyright: ignore[reportArgumentType]
+            [(f"{mark + 0.0:.{digits}f}", height(mark)) for mark in marks],
+        )
+
+
+def _box(values: np.ndarray) -> tuple[float, float, float, float, float]:
+    """Upper whisker, upper quartile, median, lower quartile and lower whisker; whiskers are at most 1.5 interquartile
+    ranges long, and end at a value."""
+    lower, median, upper = np.percentile(values, (25, 50, 75))
+    reach = 1.5 * (upper - lower)
+    ends = values[values <= upper + reach].max(), values[values >= lower - reach].min()
+    return float(max(ends[0], upper)), float(upper), float(median), float(lower), float(min(ends[1], lower))

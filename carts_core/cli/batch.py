@@ -1,5 +1,7 @@
 """`carts batch`: pipelines over many recordings, on one or several machines."""
 
+import math
+import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +11,10 @@ import tyro
 
 from ..console import Bar, Terminal
 from ..errors import CartsError
+from ..package_imports import gc_paused
 from ..settings.ranges import Count, Range
 from ..stopping import message_if_stopped
-from ..wording import counted
+from ..wording import counted, duration_text
 from .options import RangedOptions, output_folder
 
 if TYPE_CHECKING:
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
     from ..files import OutputPath
     from ..settings.optimization import Engine
 
+_BETWEEN_SUMMARIES = 1.0
+"""Minimum interval between updates of throughput and cost [s]."""
 _NAMED = 5
 """Maximum number of failed jobs named in the final message."""
 
@@ -57,10 +62,11 @@ class Batch(RangedOptions):
 
         console = Terminal()
         folder = output_folder(self.output, "batch", self.manifest.stem)
-        jobs = read_manifest(self.manifest, folder.path)
-        chosen = shard(jobs, self.shard)
-        check_options(jobs)
-        write_jobs(folder, jobs)
+        with gc_paused():
+            jobs = read_manifest(self.manifest, folder.path)
+            chosen = shard(jobs, self.shard)
+            check_options(jobs)
+            write_jobs(folder, jobs)
         failed: dict[str, str] = {}
         if not self.report_only:
             failed = self._run(console, chosen, folder)
@@ -81,10 +87,13 @@ class Batch(RangedOptions):
         """Run jobs; returns job name -> error of the failed jobs."""
         import os
 
+        from ..batch.cost import Cost, JobCost
         from ..batch.engines import Pool
         from ..package_imports import require_package
+        from ..process import tune_process
         from .batch_job import BatchWork, with_project
 
+        tune_process()
         work = BatchWork(folder, self.again, _inference(folder), self.project)
         workers = min(self.workers or os.cpu_count() or 1, len(jobs))
         if self.scheduler is None:
@@ -97,17 +106,35 @@ class Batch(RangedOptions):
         if self.project == "beside" and (those := sum(with_project(job) is not None for job in jobs)):
             counts_of = f"{those} of {counted(len(jobs), 'job')} use the project beside the recording"
             console.print(f"{counts_of} (see the logs). To use the measured joints: --project none")
-        failed, counts = {}, Counter()
+        failed, counts, done = {}, Counter(), []
+        began, shown = time.monotonic(), -math.inf
         kept = f"{folder} holds the finished jobs; rerun the command to resume"
-        with message_if_stopped(kept), Bar(console=console) as bar:
+        columns = Bar.get_default_columns()[:-1]  # The last one estimates the remaining time from jobs done earlier.
+        with message_if_stopped(kept), Bar(*columns, console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
             for outcome in engine.run(jobs):
                 counts[outcome.status] += 1
-                bar.update(task, advance=1, description=f"jobs, {counts['failed']} failed")
                 if outcome.status == "failed":
                     failed[outcome.job] = outcome.error
+                if outcome.status == "done":
+                    done.append(JobCost(outcome.seconds, outcome.processor, outcome.frames))
+                bar.update(task, advance=1)
+                left = len(jobs) - counts.total()
+                if time.monotonic() - shown > _BETWEEN_SUMMARIES or not left:
+                    shown, running = time.monotonic(), min(engine.workers, left)
+                    summary = Cost(tuple(done), left, running).summary(running or engine.workers)
+                    parts = ["jobs", f"{counts['failed']} failed", summary]
+                    bar.update(task, description=", ".join(filter(None, parts)))
         words = {"done": "done", "known": "done earlier", "busy": "run by another process", "failed": "failed"}
         console.print(", ".join(f"{counts[status]} {words[status]}" for status in words if counts[status]))
+        if done:
+            cost, seconds = Cost(tuple(done), 0), time.monotonic() - began
+            rate = f", {cost.frames / seconds:.3g} frames/s" if cost.frames else ""
+            console.print(
+                f"{counted(len(done), 'job')} with {counted(cost.frames, 'frame')} in {duration_text(seconds)} on "
+                f"{counted(engine.workers, 'worker')}{rate}, {cost.core_hours:.3g} core hours"
+            )
+            console.print(f"estimates for these jobs: {cost.forecast()}")
         return failed
 
 

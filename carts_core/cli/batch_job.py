@@ -19,14 +19,12 @@ from ..batch.folder import (
     kinematics_tables,
     read_findings,
     running,
-    write_findings,
 )
 from ..batch.manifest import Job, Step
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, remove_file, set_aside, write_text
-from ..process import tune_process
-from ..provenance import code_fingerprint, fingerprint
+from ..process import processor_time, tune_process
 from ..settings.optimization import Inference
 from .calibrate import Calibrate
 from .export import Export
@@ -68,13 +66,13 @@ class BatchWork:
 
     def __call__(self, job: Job) -> Outcome:
         """Run the unfinished steps of a job."""
-        began = time.perf_counter()
+        began, before = time.perf_counter(), processor_time()
         folder = self.folder / "jobs" / job.name
         with running(folder) as state:
             if state is None:
                 return Outcome(job.name, "busy")
             try:
-                done = _steps(job, folder, state, self)
+                done, frames = _steps(job, folder, state, self)
             except KeyboardInterrupt:
                 state.change(status="stopped")
                 raise
@@ -83,7 +81,8 @@ class BatchWork:
             except Exception as error:  # A failed job does not stop the others.
                 return _failed(job, state, "".join(traceback.format_exception(error)), began)
             state.change(status="done", attempts=0)
-        return Outcome(job.name, "done" if done else "known", seconds=time.perf_counter() - began)
+        seconds, processor = time.perf_counter() - began, processor_time() - before
+        return Outcome(job.name, "done" if done else "known", "", seconds, processor, frames)
 
 
 def with_project(job: Job) -> Path | None:
@@ -120,8 +119,12 @@ def _failed(job: Job, state: RunningJob, error: str, began: float) -> Outcome:
     return Outcome(job.name, "failed", error, time.perf_counter() - began)
 
 
-def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> int:
-    """Run the unfinished steps; returns their number."""
+def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> tuple[int, int]:
+    """Run the unfinished steps; returns their number, and the number of frames with a verdict."""
+    # Imported here, because reports need neither recordings nor robots.
+    from ..batch.results import write_findings
+    from ..provenance import code_fingerprint, fingerprint
+
     tune_process()
     log_to_stderr()
     done, key = 0, fingerprint(code_fingerprint(_CODE), *map(str, _inputs(job.recording)))
@@ -136,24 +139,31 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         key = fingerprint(key, step, job.camera, job.domain, options, inputs, *corrections)
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
-            began = time.perf_counter()
             # The findings describe earlier results. After a kill, they are written again when the job resumes.
             remove_file(folder / FINDINGS_FILE)
-            with _logged(folder / f"{step}.log"):
+            with _measured(state, step, key), _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
-            seconds = round(time.perf_counter() - began, 3)
-            state.change(steps={**state.state.steps, step: StepState(key, seconds)})
             done += 1
         if step in ("import", "calibrate"):
             sequence = (folder / _FOLDERS[step] / "sequence.toml").path
     try:
-        there = read_findings(folder) is not None
+        found = read_findings(folder)
     except (OSError, ValueError):
         set_aside(folder / FINDINGS_FILE)
-        there = False
-    if not there:
-        write_findings(job, folder, sequence)
-    return done
+        found = None
+    if found is None:
+        with _measured(state, "findings", key):
+            found = write_findings(job, folder, sequence)
+    return done, len(found.frames)
+
+
+@contextlib.contextmanager
+def _measured(state: RunningJob, step: str, key: str) -> Iterator[None]:
+    """Add the block to the finished steps, with its duration and processor time."""
+    began, before = time.perf_counter(), processor_time()
+    yield
+    seconds, processor = round(time.perf_counter() - began, 3), round(processor_time() - before, 3)
+    state.change(steps={**state.state.steps, step: StepState(key, seconds, processor)})
 
 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:

@@ -115,8 +115,8 @@ def main(arguments: list[str] | None = None) -> None:
             from ..process import keep_memory, tune_process
 
         log_to_stderr()
-        # The viewer imports PyTorch only to solve.
-        keep_memory() if isinstance(command, View) else tune_process()
+        # The viewer and a batch import PyTorch only to solve.
+        keep_memory() if isinstance(command, (View, Batch)) else tune_process()
         with stopped_by_signals():
             command.run()
     except CartsError as error:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ..arrays import pose_distance
 from ..files import OutputPath, output_stream, write_text
 from ..html import render_page
 from ..model.scene import Scene
@@ -102,7 +103,8 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
         (f"T_camera_world of {old.name}", old.T_camera_world, new.T_camera_world)
         for old, new in zip(before.cameras, after.cameras, strict=True)
     ]
-    return [(name, *pose_distance(old, new)) for name, old, new in poses if not np.array_equal(old, new)]
+    moved = [(name, pose_distance(old, new)) for name, old, new in poses if not np.array_equal(old, new)]
+    return [(name, float(angle), float(distance)) for name, (angle, distance) in moved]
 
 
 def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
@@ -139,15 +141,7 @@ def calibration_warning(before: Scene, result: CalibrationResult) -> str | None:
 def _difference(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     angle, distance = pose_distance(before, after)
     poses = {"before": before.tolist(), "after": after.tolist()}
-    return {**poses, "rotation_deg": angle, "translation_mm": distance}
-
-
-def pose_distance(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-    """Rotation angle [deg] and translation distance [mm] between two poses."""
-    turned = after[:3, :3] @ before[:3, :3].T
-    # The chord length is accurate for small angles, unlike the arc cosine of the trace.
-    angle = 2.0 * np.arcsin(np.clip(np.linalg.norm(turned - np.eye(3)) / np.sqrt(8.0), 0.0, 1.0))
-    return float(np.rad2deg(angle)), float(1000.0 * np.linalg.norm(after[:3, 3] - before[:3, 3]))
+    return {**poses, "rotation_deg": float(angle), "translation_mm": float(distance)}
 
 
 def write_calibration(

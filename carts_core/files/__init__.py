@@ -8,13 +8,17 @@ from .paths import allowed_names as allowed_names
 from .paths import check_name as check_name
 from .paths import file_name as file_name
 from .paths import name_fault as name_fault
+from .paths import open_below as open_below
+from .paths import opened_folder as opened_folder
 from .paths import output_path as output_path
+from .paths import resolved_paths as resolved_paths
 from .paths import unique_file_names as unique_file_names
 from .writing import MARKER as MARKER
 from .writing import BusyError as BusyError
 from .writing import append_line as append_line
 from .writing import csv_cell as csv_cell
 from .writing import holds_file as holds_file
+from .writing import indented_json as indented_json
 from .writing import locked_folder as locked_folder
 from .writing import output_stream as output_stream
 from .writing import pipe_stream as pipe_stream

@@ -4,9 +4,10 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 from ..errors import OutputError
@@ -148,6 +149,22 @@ def unique_file_names(texts: list[str]) -> list[str]:
         taken.add(name.casefold())
         names.append(name)
     return names
+
+
+def resolved_paths(paths: Iterable[str | Path]) -> list[str]:
+    """Absolute paths without links, as by `Path.resolve`; folders that the paths share are resolved once."""
+
+    @cache
+    def resolved(folder: str) -> str:
+        return below(*folder.rsplit("/", 1)) if folder else ""
+
+    def below(folder: str, name: str) -> str:
+        path = f"{resolved(folder)}/{name}"
+        return os.path.realpath(path) if name in ("", ".", "..") or os.path.islink(path) else path
+
+    here = os.getcwd()
+    whole = (path if path.startswith("/") else f"{here}/{path}" for path in map(str, paths))
+    return [below(*path.rsplit("/", 1)) for path in whole]
 
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC

@@ -262,8 +262,16 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
         FileNotFoundError, IsADirectoryError, OSError: as raised by the system.
         RefusedFileError: the path is not a regular file, the file is too large, or the name is invalid.
     """
+    return os.fdopen(_opened(path, kind)[0], "rb")
+
+
+def _opened(path: Path | str, kind: Kind, folder: int | None = None) -> tuple[int, int]:
+    """Descriptor and size [bytes] of a regular file, given by its path or by its name in an open folder, where links
+    are refused; raises as `open_regular`.
+    """
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY | (0 if folder is None else os.O_NOFOLLOW)
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+        descriptor = os.open(path, flags, dir_fd=folder)
     except ValueError as error:  # The name contains a null character.
         raise RefusedFileError(f"this is not a valid file name ({error})") from error
     try:
@@ -276,7 +284,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
             raise _too_large(kind, f"is {status.st_size / MIB:.0f} MiB")
         if status.st_size <= _MAX_POINTER_BYTES and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
             raise LfsPointerError(_POINTER_TEXT)
-        return os.fdopen(descriptor, "rb")
+        return descriptor, status.st_size
     except BaseException:
         os.close(descriptor)
         raise
@@ -287,13 +295,25 @@ def check_regular(path: Path, kind: Kind) -> None:
     open_regular(path, kind).close()
 
 
-def read_bytes(path: Path, kind: Kind) -> bytes:
-    """Read a file; errors are those of `open_regular`."""
-    with open_regular(path, kind) as file:
-        size = os.fstat(file.fileno()).st_size
-        content = file.read(size + 1)  # Reading allocates memory of the requested size.
-        if len(content) > size:
-            content += file.read(kind.limit + 1 - len(content))
+def read_bytes(path: Path | str, kind: Kind, folder: int | None = None) -> bytes:
+    """Read a file; errors are those of `open_regular`.
+
+    Args:
+        path: path of the file; with `folder`, its name.
+        kind: kind of the file.
+        folder: open folder of the file, in which links are refused; None for any path.
+    """
+    descriptor, size = _opened(path, kind, folder)
+    try:
+        content = os.read(descriptor, size + 1)  # Reading allocates memory of the requested size.
+        if len(content) != size:
+            with os.fdopen(descriptor, "rb", closefd=False) as file:
+                file.seek(0)
+                content = file.read(size + 1)
+                if len(content) > size:
+                    content += file.read(kind.limit + 1 - len(content))
+    finally:
+        os.close(descriptor)
     if len(content) > kind.limit:
         raise _too_large(kind, "grew while it was read")
     return content
@@ -440,9 +460,14 @@ def typed_json(content: bytes, kind: type[T]) -> T:
     """Parse JSON to a dataclass or another type without `Any`; `ValueError` if it is not JSON of this type. Faster than
     `typed(parse_json(...))`, whose limits the type makes unnecessary: it bounds the depth, and numbers are finite."""
     try:
-        return msgspec.json.decode(content, type=kind, dec_hook=_path)
+        return _decoder(kind).decode(content)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(str(error)) from error
+
+
+@cache
+def _decoder(kind: type[T]) -> msgspec.json.Decoder[T]:
+    return msgspec.json.Decoder(kind, dec_hook=_path)
 
 
 def _path(kind: type, value: Any) -> Any:

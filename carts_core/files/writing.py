@@ -21,6 +21,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
+import msgspec
+
 from ..errors import OutputError
 from .paths import OutputPath, as_output, explained, kind_of, open_below, opened_folder, status
 
@@ -75,6 +77,14 @@ def write_bytes(path: OutputPath | Path, content: bytes) -> None:
 def write_text(path: OutputPath | Path, text: str) -> None:
     """Write a string as UTF-8 with `write_bytes`; line ends are kept."""
     write_bytes(path, text.encode())
+
+
+def indented_json(value: object) -> bytes:
+    """Indented JSON of a value; for large values several times faster than `json.dumps` with `indent`."""
+    try:
+        return msgspec.json.format(msgspec.json.encode(value), indent=1)
+    except UnicodeEncodeError:  # Names of files that are not UTF-8 are escaped.
+        return json.dumps(value, indent=1).encode()
 
 
 def write_new(path: OutputPath | Path, content: bytes) -> bool:

@@ -1,5 +1,6 @@
 """Page of a batch: table of jobs, failures first, and the worst frames."""
 
+import heapq
 import threading
 from collections import Counter
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from carts_core.batch.cost import Cost
 from carts_core.batch.folder import (
     ORDER,
     FrameFinding,
@@ -14,12 +16,12 @@ from carts_core.batch.folder import (
     known_jobs,
     most_urgent_first,
     read_jobs,
-    review_project,
-    sequence_file,
 )
+from carts_core.batch.results import review_project, sequence_file
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import output_path
 from carts_core.files.reading import IMAGE, read_bytes
+from carts_core.package_imports import gc_paused
 from carts_core.recording import Sequence
 from carts_viewer.start.host import Host
 from carts_viewer.transport.document import render
@@ -28,8 +30,11 @@ _UPDATE_INTERVAL = 5.0
 """Interval between updates while jobs run [s]."""
 _MAX_WORST = 12
 """Maximum number of shown frames."""
-_MAX_LISTED = 500
-"""Maximum number of listed jobs."""
+_ROWS = 100
+"""Number of jobs on a page of the list."""
+_STEP = {"previous": -1, "next": 1}
+_MAX_WANTED = 200
+"""Maximum length of a searched name [characters]."""
 _SEPARATOR = "\n"
 """Separator of job and frame in the value of a button; names do not contain it."""
 
@@ -47,25 +52,43 @@ class BatchPage:
         self._jobs = read_jobs(folder)
         self._problem = ""
         self._known: list[KnownJob] = []
+        self._shown, self._wanted, self._page = "", "", 0
+        self._addresses: dict[tuple[object, ...], str] = {}
+        """Addresses of the shown pictures, by job, file and times of the job's files."""
+        self._waits = False
         self._closed = threading.Event()
 
     def show(self) -> None:
         """Update the document, and repeat the update while jobs run."""
-        self._known = known = most_urgent_first(known_jobs(self._batch, self._jobs, self._known))
-        counts = Counter(entry.status for entry in known)
+        self._known = known_jobs(self._batch, self._jobs, self._known)
+        with gc_paused():
+            self._render()
+        if any(entry.status == "running" for entry in self._known):
+            self._update()
+
+    def _render(self) -> None:
+        """Show the known jobs; the document is sent only if it has changed."""
+        known, cost = most_urgent_first(self._known), Cost.of(self._known)
+        listed = [entry for entry in known if self._wanted.casefold() in entry.job.name.casefold()]
+        self._page = max(0, min(self._page, (len(listed) - 1) // _ROWS))
+        counts, first = Counter(entry.status for entry in known), self._page * _ROWS
         content = render(
             "batch.html",
             name=self._batch.path.name,
             summary=", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status]),
+            cost=cost.summary(counts["running"]),
+            forecast=cost.forecast(),
             problem=self._problem,
-            known=known,
-            most=_MAX_LISTED,
+            wanted=self._wanted,
+            rows=listed[first : first + _ROWS],
+            first=first,
+            listed=len(listed),
             worst=self._worst(known),
             separator=_SEPARATOR,
         )
-        self._site.document.show(content)
-        if counts["running"]:
-            self._update()
+        if content != self._shown:
+            self._shown = content
+            self._site.document.show(content)
 
     def choose(self, name: str, value: str) -> None:
         """Carry out a choice of the user."""
@@ -76,6 +99,11 @@ class BatchPage:
             case "review":
                 job, _, frame = value.partition(_SEPARATOR)
                 return self._review(job, frame)
+            case "find" | "previous" | "next":
+                self._wanted, self._page = (
+                    (value[:_MAX_WANTED], 0) if name == "find" else (self._wanted, self._page + _STEP[name])
+                )
+                return self._render()
         self.show()
 
     def click(self, u: float, v: float) -> None:
@@ -112,11 +140,15 @@ class BatchPage:
         found = [
             (frame.probability, entry, frame)
             for entry in known
-            for frame in (entry.findings.frames if entry.findings else ())
-            if frame.picture
+            for frame in (entry.results.pictured if entry.results else ())
         ]
-        worst = sorted(found, key=lambda each: -each[0])[:_MAX_WORST]
-        return [(each, entry, frame, self._published(entry, frame.picture)) for each, entry, frame in worst]
+        worst = heapq.nlargest(_MAX_WORST, found, key=lambda each: each[0])
+        keys = [(entry.job.name, frame.picture, entry.written) for _, entry, frame in worst]
+        self._addresses = {
+            key: self._addresses.get(key) or self._published(entry, frame.picture)
+            for key, (_, entry, frame) in zip(keys, worst, strict=True)
+        }
+        return [(*each, self._addresses[key]) for key, each in zip(keys, worst, strict=True)]
 
     def _published(self, entry: KnownJob, name: str) -> str:
         """URL of a job's picture; empty if the picture cannot be read."""
@@ -128,8 +160,17 @@ class BatchPage:
         return "" if image is None else self._site.page.media.publish(cv2.imencode(".jpg", image)[1].tobytes())
 
     def _update(self) -> None:
+        """Update the page after a while, once for any number of calls until then."""
+
+        def update() -> None:
+            self._waits = False
+            if not self._closed.is_set():
+                self.show()
+
         def wait() -> None:
             if not self._closed.wait(_UPDATE_INTERVAL):
-                self._site.post(lambda: None if self._closed.is_set() else self.show())
+                self._site.post(update)
 
-        threading.Thread(target=wait, name="carts-batch-page", daemon=True).start()
+        if not self._waits:
+            self._waits = True
+            threading.Thread(target=wait, name="carts-batch-page", daemon=True).start()

@@ -25,7 +25,6 @@ from carts_viewer.start.start_page import StartPage, remember
 from carts_viewer.transport.document import Document, render
 from carts_viewer.transport.events import Chosen, Clicked
 from carts_viewer.transport.page import Page
-from carts_viewer.wizard.wizard import RecordingWizard
 
 _log = logging.getLogger(__name__)
 
@@ -134,6 +133,9 @@ class Site:
 
     def show_recording(self, draft: str | None = None, source: Path | None = None) -> None:
         """See `Host.show_recording`."""
+        # Its calibration imports torch and SciPy, which a batch and a sequence do not need.
+        from carts_viewer.wizard.wizard import RecordingWizard  # noqa: PLC0415
+
         self._show(lambda: RecordingWizard(self, draft, source))
 
     def open_sample(self) -> None:

@@ -24,7 +24,6 @@ from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.start.host import FileBrowser, Host, Wanted
 from carts_viewer.start.uploads import Uploads
 from carts_viewer.transport.document import render
-from carts_viewer.wizard.draft import delete_draft, drafts
 
 _MAX_RECENT = 24
 _WIDTH = 320
@@ -176,6 +175,9 @@ class StartPage:
 
     def show(self) -> None:
         """Update the document."""
+        # The wizard's calibration imports torch, which the list of recent recordings does not need.
+        from carts_viewer.wizard.draft import drafts  # noqa: PLC0415
+
         content = render(
             "start.html",
             problem=self._problem,
@@ -198,6 +200,8 @@ class StartPage:
             case "draft":
                 return self._site.show_recording(value)
             case "delete-draft":
+                from carts_viewer.wizard.draft import delete_draft  # noqa: PLC0415
+
                 delete_draft(value)
             case "sample":
                 return self._site.open_sample()

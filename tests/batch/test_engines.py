@@ -9,7 +9,7 @@ import pytest
 from light_work import LightWork, process_and_threads
 
 from carts_core.batch.engines import ATTEMPTS, Cluster, Pool, Work
-from carts_core.batch.folder import present_status, running
+from carts_core.batch.folder import known_jobs, running
 from carts_core.batch.manifest import Job
 from carts_core.files import output_path
 
@@ -42,7 +42,7 @@ def test_jobs_of_a_killed_worker_are_done_by_another_one_until_they_are_given_up
 
 
 def test_a_job_whose_process_was_killed_is_lost(tmp_path: Path) -> None:
-    folder = output_path(tmp_path / "job")
+    (job,), folder = jobs(1), output_path(tmp_path) / "jobs" / "job00"
     if (child := os.fork()) == 0:
         try:
             with running(folder):
@@ -50,7 +50,9 @@ def test_a_job_whose_process_was_killed_is_lost(tmp_path: Path) -> None:
         finally:
             os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
-    assert present_status(folder)[0] == "lost"
+    assert [entry.status for entry in known_jobs(output_path(tmp_path), [job])] == ["lost"]
+    with running(folder):
+        assert [entry.status for entry in known_jobs(output_path(tmp_path), [job])] == ["running"]
 
 
 def test_workers_have_as_many_threads_as_asked_for_and_end_with_an_engine_that_is_ended_early(

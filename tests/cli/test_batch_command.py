@@ -16,7 +16,7 @@ from processes import command as of_process
 from processes import descendants, eventually
 
 from carts_core.batch.engines import Pool
-from carts_core.batch.folder import JOB_FILE, present_status
+from carts_core.batch.folder import JOB_FILE, known_jobs
 from carts_core.batch.manifest import read_manifest
 from carts_core.batch.report import write_batch_report
 from carts_core.cli import main
@@ -70,7 +70,13 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
     batch = tmp_path / "batch"
     command = ["batch", str(manifest(sequence)), "--output", str(batch), "--workers", "1"]
     main(command)
-    assert "2 done" in said()
+    told = said()
+    assert "2 done" in told and re.search(r"2 jobs with 2 frames in \d+ s on 1 worker, [\d.e-]+ frames/s", told)
+    assert "core hours" in told and "estimates for these jobs: 1 worker" in told
+    for path in batch.glob("jobs/*/job.json"):
+        steps = json.loads(path.read_text())["steps"]
+        assert list(steps) == ["optimize", "findings", "export"] or list(steps) == ["optimize", "export", "findings"]
+        assert all(0.0 <= step["processor"] and 0.0 <= step["seconds"] for step in steps.values())
     assert (batch / "inference.txt").read_text() in ("torch", "onnx")
     for domain in ("regular", "dark"):
         plain = tmp_path / "plain" / domain
@@ -129,7 +135,7 @@ def test_findings_of_a_job_whose_worker_died_before_them_are_made_when_it_goes_o
     assert BatchWork(batch)(job).status == "done"
     whole = results(batch.path)
     with monkeypatch.context() as patch:
-        patch.setattr("carts_core.cli.batch_job.write_findings", lambda *_: pytest.fail("its worker dies"))
+        patch.setattr("carts_core.batch.results.write_findings", lambda *_: pytest.fail("its worker dies"))
         with pytest.raises(pytest.fail.Exception):
             BatchWork(batch, again=True)(job)
     # What they were before is not taken for what they are now.
@@ -232,8 +238,7 @@ def test_200_jobs_come_to_the_same_bytes_on_the_pool_in_shards_and_on_a_cluster_
         killed = _killed_now_and_then([path, "--output", tmp_path / name, "--workers", "2", *further], 10.0, 1)
         assert results(tmp_path / name) == whole and killed > 1
         batch = output_path(tmp_path / name)
-        states = [present_status(batch / "jobs" / job.name) for job in read_manifest(path)]
-        assert [status for status, _ in states] == ["done"] * jobs
+        assert [entry.status for entry in known_jobs(batch, read_manifest(path))] == ["done"] * jobs
         print(f"{name}: {killed} workers killed")
 
 

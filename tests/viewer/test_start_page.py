@@ -14,8 +14,9 @@ from playwright.sync_api import Browser, expect
 from viewer_tab import READY, new_context
 from waiting import eventually, wait_in
 
-from carts_core.batch.folder import is_batch, known_jobs, read_jobs, review_project, write_jobs
+from carts_core.batch.folder import is_batch, known_jobs, read_jobs, write_jobs
 from carts_core.batch.manifest import read_manifest
+from carts_core.batch.results import review_project
 from carts_core.cli.batch_job import BatchWork
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import output_path
