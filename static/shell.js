@@ -238,7 +238,7 @@
   // ---- A small screen ---------------------------------------------------------------------------------------------------
 
   const small = matchMedia("(max-width: 36em)");
-  let bar = null;
+  let bar = null, tabsOpened = false;
   const ACTIONS = {
     previous: ["MoveFrame", { by: -1 }], next: ["MoveFrame", { by: 1 }], accept: ["AcceptAndNext"],
     work: ["SetReview", { state: "needs work" }], reject: ["SetReview", { state: "rejected" }],
@@ -254,10 +254,18 @@
       <button data-do="next" aria-label="Next frame">›</button><button data-do="controls" aria-label="All controls">⋯</button>`;
     bar.addEventListener("click", (event) => {
       const name = event.target.closest?.("button")?.dataset.do;
-      if (name === "controls") document.body.classList.toggle("carts-controls");
-      else if (name) window.carts.report(...ACTIONS[name]);
+      if (name === "controls" && document.body.classList.toggle("carts-controls")) openTabs();
+      if (name in ACTIONS) window.carts.report(...ACTIONS[name]);
     });
     document.body.append(bar);
+  }
+
+  /** Open the tabs of the panels, which start collapsed on a small screen, at the first use of the controls. */
+  function openTabs() {
+    if (tabsOpened) return;
+    const collapsed = document.querySelector(".mantine-Tabs-root > [role=button][aria-expanded=false]");
+    tabsOpened = collapsed !== null;
+    collapsed?.click();
   }
 
   function drawBar() {
@@ -268,8 +276,18 @@
     if (line.textContent !== text) line.textContent = text;
   }
 
+  // Between two panels, a narrow window leaves no room for the image, so the left panel starts collapsed.
+  let roomMade = !matchMedia("(max-width: 60em)").matches;
+  function makeRoom() {
+    const collapse = roomMade || small.matches ? null : document.querySelector("[data-dock-region-collapse=left]");
+    if (!collapse) return;
+    roomMade = true;
+    if (collapse.ariaExpanded === "true") collapse.click();
+  }
+
   setInterval(() => {
     document.body.classList.toggle("carts-small", small.matches);
+    makeRoom();
     buildBar();
     drawBar();
   }, 300);

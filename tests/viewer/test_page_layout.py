@@ -165,7 +165,7 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
     assert page.get_by_role("button", name="Undo", exact=True).is_hidden()
     page.get_by_role("button", name="All controls").click()
     expect(page.get_by_role("button", name="Undo", exact=True)).to_be_visible()
-    page.get_by_text("Optimize · Review").click()
+    expect(page.get_by_role("tab", name="Optimize", exact=True)).to_be_visible()
 
     def image_above_sheet() -> bool:
         sheet, canvas = (
@@ -182,6 +182,21 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
     tab.put(intents.Step())
     page.locator(".uplot").first.wait_for(state="visible")
     eventually(lambda: cut_off(page), lambda cut: not cut)
+
+
+def test_a_narrow_window_has_room_for_the_image(open_tab: OpenTab) -> None:
+    """The left panel starts collapsed, and the view bar lies within the picture."""
+    tab = open_tab(window=(700, 800))
+
+    def within() -> bool:
+        bar, canvas = (box_of(tab.page.locator(name)) for name in (".carts-bar", "canvas"))
+        return (
+            canvas["x"] <= bar["x"]
+            and bar["x"] + bar["width"] <= canvas["x"] + canvas["width"]
+            and canvas["width"] > 300
+        )
+
+    eventually(within)
 
 
 def check_keys(tab: Tab) -> None:
