@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Rows
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from itertools import accumulate, chain
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -208,6 +208,8 @@ _MAX_ERROR_LENGTH = 1000
 """Maximum length of a stored error [characters]."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
 """Statuses, most urgent first."""
+_JOINED = 256
+"""Number of jobs whose values of joints are stored in one table."""
 _ENDED = ("failed", "stopped", "done")
 """Statuses that change only with the file of the state."""
 
@@ -254,25 +256,28 @@ class JointErrors:
     """Corrections and deviations of the joints of all jobs, as in `Findings`."""
 
     def __init__(self) -> None:
-        self._jobs: list[tuple[tuple[str, ...], list[int], np.ndarray]] = []
-        """For each job, names of joints, numbers of their corrections and deviations, and these values."""
+        self._tables: defaultdict[tuple[str, ...], list[np.ndarray]] = defaultdict(list)
+        """Names of joints -> for each job, rows of their corrections and deviations, padded with NaN."""
 
     def add(self, found: Findings) -> None:
         """Add the values of a job."""
         names = tuple(found.corrections)
-        lists = [*found.corrections.values(), *(found.deviations.get(name, []) for name in names)]
-        self._jobs.append((names, list(map(len, lists)), np.array([*chain.from_iterable(lists)], dtype=float)))
+        rows = [*found.corrections.values(), *(found.deviations.get(name, []) for name in names)]
+        longest = max(map(len, rows), default=0)
+        padded = (row if len(row) == longest else row + (longest - len(row)) * [np.nan] for row in rows)
+        values = np.fromiter(chain.from_iterable(padded), float, len(rows) * longest)
+        self._tables[names].append(values.reshape(len(rows), longest))
 
-    def values(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """`ARM.JOINT` -> corrections and deviations [deg, mm], in the order of the jobs."""
-        found: defaultdict[str, tuple[list[np.ndarray], list[np.ndarray]]] = defaultdict(lambda: ([], []))
-        for names, lengths, values in self._jobs:
-            parts = [values[end - length : end] for end, length in zip(accumulate(lengths), lengths, strict=True)]
-            for number, name in enumerate(names):
-                corrections, deviations = found[name]
-                corrections.append(parts[number])
-                deviations.append(parts[number + len(names)])
-        return {name: (np.concatenate(each[0]), np.concatenate(each[1])) for name, each in found.items()}
+    def joints(self) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        """Name, corrections and deviations [deg, mm] of each joint with corrections."""
+        for tables in self._tables.values():
+            tables[:] = [np.concatenate(tables[n : n + _JOINED], axis=1) for n in range(0, len(tables), _JOINED)]
+        for name in dict.fromkeys(chain.from_iterable(self._tables)):
+            with_it = [(names.index(name), len(names), each) for names, each in self._tables.items() if name in names]
+            corrections = np.concatenate([table[row] for row, _, tables in with_it for table in tables])
+            deviations = np.concatenate([table[row + count] for row, count, tables in with_it for table in tables])
+            if len(corrections := corrections[~np.isnan(corrections)]):
+                yield name, corrections, deviations[~np.isnan(deviations)]
 
 
 def known_jobs(

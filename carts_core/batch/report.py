@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,25 +31,28 @@ def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Pa
     errors = JointErrors()
     folder, known = batch / "report", known_jobs(batch, jobs, joints=errors)
     with gc_paused():
-        drifts, joints, cost = _drifts(known), errors.values(), Cost.of(known)
-        statistics = {name: _statistics(*values) for name, values in joints.items()}
+        drifts, cost = _drifts(known), Cost.of(known)
+        verdicts = {entry.job.name: _verdicts(entry) for entry in known}
+        statistics, boxes = {}, {}
+        for name, corrections, deviations in errors.joints():
+            statistics[name], boxes[name] = _statistics(corrections, deviations), _box(corrections)
         page = render_page(
             "batch.html",
             title=title,
             sections={
                 "Jobs": _job_table(known),
-                "Verdicts": _verdict_table(known),
+                "Verdicts": _verdict_table(verdicts),
                 "Worst frames": _worst(batch, folder, known),
                 "Base frames": _drift_table(drifts),
                 "Joints": _joint_table(statistics),
                 "Cost": _cost_table(cost),
             },
-            plot=BoxPlot.of({name: corrections for name, (corrections, _) in joints.items()}),
+            plot=BoxPlot.of(boxes) if boxes else None,
         )
         document = {
             "format": "carts-batch-report/1",
             "jobs": {entry.job.name: {"status": entry.status, "error": entry.state.error} for entry in known},
-            "verdicts": {entry.job.name: _verdicts(entry) for entry in known},
+            "verdicts": verdicts,
             "base_frames": drifts,
             "joints": statistics,
             "cost": {
@@ -86,9 +90,9 @@ def _verdicts(entry: KnownJob) -> dict[str, int]:
     return {verdict: entry.results.verdicts.get(verdict, 0) if entry.results else 0 for verdict in _VERDICTS}
 
 
-def _verdict_table(known: Sequence[KnownJob]) -> Table | None:
+def _verdict_table(verdicts: Mapping[str, dict[str, int]]) -> Table | None:
     """Table of verdicts, sorted by the share of failed frames."""
-    rows = [(entry.job.name, counts) for entry in known if sum((counts := _verdicts(entry)).values())]
+    rows = [(name, counts) for name, counts in verdicts.items() if any(counts.values())]
     rows.sort(key=lambda row: (-row[1]["failed"] / sum(row[1].values()), -row[1]["doubtful"] / sum(row[1].values())))
     total = {verdict: sum(counts[verdict] for _, counts in rows) for verdict in _VERDICTS}
     return Table.of(
@@ -219,24 +223,32 @@ def _cost_table(cost: Cost) -> Table | None:
     )
 
 
+class Box(NamedTuple):
+    """Box of a plot, from its top to its bottom; whiskers are at most 1.5 interquartile ranges long, and end at a
+    value."""
+
+    upper_whisker: float
+    upper_quartile: float
+    median: float
+    lower_quartile: float
+    lower_whisker: float
+
+
 @dataclass(frozen=True)
 class BoxPlot:
     """Box plot of the corrections of each joint, drawn by the page's template.
 
-    All values are heights relative to the plot, from 0 at its top to 1 at its bottom.
+    Its values are heights relative to the plot, from 0 at its top to 1 at its bottom.
     """
 
-    boxes: dict[str, tuple[float, float, float, float, float]]
-    """Joint -> upper whisker, upper quartile, median, lower quartile and lower whisker."""
+    boxes: dict[str, Box]
+    """Joint -> its box."""
     ticks: list[tuple[str, float]]
     """Labels [deg, mm] and heights of the axis."""
 
     @staticmethod
-    def of(joints: Mapping[str, np.ndarray]) -> "BoxPlot | None":
-        """Plot of each joint's values [deg, mm]; None without joints."""
-        boxes = {name: _box(values) for name, values in joints.items() if len(values)}
-        if not boxes:
-            return None
+    def of(boxes: Mapping[str, Box]) -> "BoxPlot":
+        """Plot of the boxes of all joints [deg, mm]."""
         lowest, highest = min(0.0, *(box[-1] for box in boxes.values())), max(0.0, *(box[0] for box in boxes.values()))
         size = max(highest - lowest, 1e-6)
         rough = size / _TICKS
@@ -251,15 +263,13 @@ class BoxPlot:
 
         digits = max(0, -int(np.floor(np.log10(step))))
         return BoxPlot(
-            {name: tuple(map(height, box)) for name, box in boxes.items()},  # pyright: ignore[reportArgumentType]
+            {name: Box(*map(height, box)) for name, box in boxes.items()},
             [(f"{mark + 0.0:.{digits}f}", height(mark)) for mark in marks],
         )
 
 
-def _box(values: np.ndarray) -> tuple[float, float, float, float, float]:
-    """Upper whisker, upper quartile, median, lower quartile and lower whisker; whiskers are at most 1.5 interquartile
-    ranges long, and end at a value."""
+def _box(values: np.ndarray) -> Box:
     lower, median, upper = np.percentile(values, (25, 50, 75))
     reach = 1.5 * (upper - lower)
-    ends = values[values <= upper + reach].max(), values[values >= lower - reach].min()
-    return float(max(ends[0], upper)), float(upper), float(median), float(lower), float(min(ends[1], lower))
+    top, bottom = values[values <= upper + reach].max(), values[values >= lower - reach].min()
+    return Box(float(max(top, upper)), float(upper), float(median), float(lower), float(min(bottom, lower)))

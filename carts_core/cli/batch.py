@@ -65,7 +65,8 @@ class Batch(RangedOptions):
         with gc_paused():
             jobs = read_manifest(self.manifest, folder.path)
             chosen = shard(jobs, self.shard)
-            check_options(jobs)
+            if not self.report_only:
+                check_options(jobs)
             write_jobs(folder, jobs)
         failed: dict[str, str] = {}
         if not self.report_only:
@@ -90,10 +91,8 @@ class Batch(RangedOptions):
         from ..batch.cost import Cost, JobCost
         from ..batch.engines import Pool
         from ..package_imports import require_package
-        from ..process import tune_process
         from .batch_job import BatchWork, with_project
 
-        tune_process()
         work = BatchWork(folder, self.again, _inference(folder), self.project)
         workers = min(self.workers or os.cpu_count() or 1, len(jobs))
         if self.scheduler is None:
@@ -140,10 +139,15 @@ class Batch(RangedOptions):
 
 def _inference(folder: "OutputPath") -> "Engine":
     """Inference engine of all jobs: the faster engine on the machine that started the batch."""
-    from ..files import write_new
+    from ..files import holds_file, write_new
     from ..files.reading import SETTINGS, read_text
-    from ..networks.extractor import FeatureExtractor
+    from ..process import tune_process
 
     path = folder / "inference.txt"
-    write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
+    if not holds_file(path):
+        # Imported here, because it imports PyTorch, which a resumed batch does not need.
+        from ..networks.extractor import FeatureExtractor
+
+        tune_process()
+        write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
     return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"

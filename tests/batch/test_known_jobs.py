@@ -95,7 +95,7 @@ def test_states_of_earlier_versions_have_no_processor_time(tmp_path: Path) -> No
 
 
 def test_a_report_has_the_statistics_of_all_values_and_the_cost(tmp_path: Path) -> None:
-    batch, jobs, written = archive(tmp_path, [3, 1, 7], x=JobState("failed", error="Line\nNo space <left>."))
+    batch, jobs, written = archive(tmp_path, [3, 1, 0, 7], x=JobState("failed", error="Line\nNo space <left>."))
     page = write_batch_report(batch, "all", jobs).read_text()
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     values = np.concatenate([found.corrections["psm1.yaw"] for found in written])
@@ -109,8 +109,8 @@ def test_a_report_has_the_statistics_of_all_values_and_the_cost(tmp_path: Path) 
         "median_reported": np.median(deviations),
     }
     assert report["jobs"]["x"] == {"status": "failed", "error": "Line\nNo space <left>."}
-    assert report["verdicts"]["case002"] == {"good": 7, "doubtful": 0, "failed": 0}
-    assert report["cost"]["frames"] == 11 and [row["workers"] for row in report["cost"]["workers"]] == [1, 2]
+    assert report["verdicts"]["case003"] == {"good": 7, "doubtful": 0, "failed": 0}
+    assert report["cost"]["frames"] == 11 and [row["workers"] for row in report["cost"]["workers"]] == [1, 2, 4]
     assert "<td>No space &lt;left&gt;.</td>" in page and page.count("<svg") == 1 and "psm1.yaw</text>" in page
 
 
