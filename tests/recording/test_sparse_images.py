@@ -10,6 +10,7 @@ from carts_core.errors import SequenceError, SettingsError
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, SurfaceSolver
 from carts_core.recording import Sequence
+from carts_core.recording.importing.cameras import Images, united_ids
 from carts_core.recording.importing.importer import find
 from carts_core.settings.interchange import NO_TABLE, ImportOptions
 
@@ -70,3 +71,10 @@ def test_frames_with_one_camera_are_imported(sparse: Path, tmp_path: Path) -> No
     found = find(folder, ImportOptions(source="folder", kinematics=NO_TABLE))
     assert len(found.frame_ids) == 3 and [camera.sparse_images for camera in found.cameras] == [False, True]
     assert any("1 of 3 frames have no image of this camera" in note.text for note in found.notes)
+
+
+def test_images_with_equal_numbers_are_in_the_order_of_their_names() -> None:
+    ids = ("0", "00", "000", "0000", "1", "01", "001")
+    given = Images(Path("left"), "{frame}.png", ids, (64, 48))
+    wanted = "0", "00", "000", "0000", "001", "01", "1"
+    assert united_ids({"left": given}, Path()) == united_ids({"left": given, "right": given}, Path()) == wanted

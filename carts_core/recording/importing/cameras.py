@@ -285,7 +285,7 @@ def united_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
     if not all(each.pattern for each in images.values()):
         return shared
     every = {frame for each in images.values() for frame in each.ids}
-    return tuple(sorted(every, key=int)) if all(map(str.isdecimal, every)) else shared
+    return tuple(sorted(every, key=lambda number: (int(number), number))) if all(map(str.isdecimal, every)) else shared
 
 
 def cameras_of(
