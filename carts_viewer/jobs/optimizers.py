@@ -20,17 +20,16 @@ from carts_core.settings.optimization import Inference
 from carts_core.settings.serialization import to_plain
 from carts_viewer.jobs.live_stream import LiveEnded, LiveStep, LiveTask
 from carts_viewer.jobs.solver import (
-    Advanced,
     Calibrated,
     CalibrationStep,
     CalibrationTask,
-    Ended,
     Estimate,
     Fit,
     FrameTask,
     Masks,
     NetworkChoice,
     RefineTask,
+    RunResult,
     SequenceStep,
     SequenceTask,
     Smoothed,
@@ -59,13 +58,13 @@ class ActiveRun:
         reply: the next result, if it was requested.
     """
 
-    def __init__(self, steps: "Run[Started | Advanced | Ended]", task: FrameTask) -> None:
+    def __init__(self, steps: Run[RunResult], task: FrameTask) -> None:
         self.steps, self.task, self.cameras = steps, task, task.cameras
         self.provenance: Provenance | None = None
-        self.reply: Reply[Started | Advanced | Ended | None] | None = None
+        self.reply: Reply[RunResult | None] | None = None
         self.due = 0
 
-    def request(self) -> "Reply[Started | Advanced | Ended | None]":
+    def request(self) -> Reply[RunResult | None]:
         """The requested result; the next one is requested if there is none."""
         self.reply = self.reply or self.steps.next()
         return self.reply

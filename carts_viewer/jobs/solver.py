@@ -146,6 +146,11 @@ class Advanced:
 
 
 @dataclass(frozen=True)
+class Stepped:
+    """An iterate of a run that is not displayed, so it is not sent."""
+
+
+@dataclass(frozen=True)
 class Ended:
     """Last result of a run; only that of a displayed run is assessed."""
 
@@ -156,6 +161,9 @@ class Ended:
     """Losses of all iterates, comparable across stages."""
     base_frame_gain: float | None = None
     """The share of the residual that free base frames would explain [1]; None if unknown."""
+
+
+RunResult = Started | Advanced | Stepped | Ended
 
 
 @dataclass(frozen=True)
@@ -321,15 +329,18 @@ class Solver:
         """Mask of the object of a prompt."""
         return self.segmenter().segment(image, prompt)
 
-    def run(self, task: FrameTask) -> Iterator[Started | Advanced | Ended]:
-        """Optimize a frame; yields `Started`, the iterates, and `Ended`."""
+    def run(self, task: FrameTask) -> Iterator[RunResult]:
+        """Optimize a frame; yields `Started`, `Advanced` or `Stepped` for each iterate, and `Ended`."""
         self._report("Preparing the frame")
         optimizer = self._frame_optimizer(task)
         weights = self._weights(task.target)
         yield Started(weights, self._domain_warnings(task) if task.shown else ())
         while (iterate := optimizer.step()) is not None:
-            best = optimizer.best
-            yield Advanced(_plain(iterate), optimizer.history[-1].stage, best.index if best else 0)
+            if task.shown:
+                best = optimizer.best
+                yield Advanced(_plain(iterate), optimizer.history[-1].stage, best.index if best else 0)
+            else:
+                yield Stepped()
         best = None if optimizer.best is None else _plain(optimizer.best)
         if not task.shown:
             yield Ended(best, optimizer.stop_reason)

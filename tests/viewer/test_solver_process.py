@@ -127,6 +127,33 @@ def _kill(process: SolverProcess) -> int:
     return pid
 
 
+def test_a_killed_launcher_is_started_again(untrained_weights: Path) -> None:
+    with closing(SolverProcess()) as process:
+        factory = OptimizerFactory(report=lambda text: None, requests=process, weights=(untrained_weights,))
+        known = factory.prepare().result()
+        pid = process.pid
+        assert pid is not None
+        os.kill(int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]), signal.SIGKILL)
+        eventually(lambda: process.pid, lambda now: now not in (None, pid), timeout=60)
+        assert not _runs(pid) and factory.prepare().result() == known
+
+
+def test_a_process_that_never_replies_is_started_again_only_by_a_request(untrained_weights: Path) -> None:
+    with closing(SolverProcess()) as process:
+        factory = OptimizerFactory(report=lambda text: None, requests=process, weights=(untrained_weights,))
+        process.start()
+        eventually(lambda: process.pid, lambda pid: pid is not None, timeout=60)
+        for _ in range(2):
+            _kill(process)
+        waiting, pid = factory.prepare(), process.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(SolverStopped, match="cannot be started"):
+            waiting.result()
+        assert process.pid is None
+        assert factory.prepare().result()
+
+
 def test_an_error_of_a_task_is_the_error_of_its_reply(solver: SolverProcess, tmp_path: Path) -> None:
     factory = OptimizerFactory(report=lambda text: None, requests=solver, weights=(tmp_path / "none.safetensors",))
     with pytest.raises(WeightsError, match=r"none\.safetensors is missing"):
