@@ -502,12 +502,13 @@ def launch() -> None:
     parent, descriptor = (int(text) for text in sys.argv[1:3])
     end_with_parent(parent, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the page's process.
-    os.nice(_NICENESS)
-    with gc_paused():
-        tune_process()
-        for name in _IMPORTED:
-            import_module(name)
+    # On Linux, a thread has a niceness of its own, which is never decreased again.
+    importing = threading.Thread(target=_import)
+    importing.start()
+    importing.join()
+    tune_process()
     gc.freeze()
+    urgent = False
     messages, launcher = socket.socket(fileno=descriptor), os.getpid()
     while (received := socket.recv_fds(messages, 1, 1))[0]:
         (pipe,) = received[1]
@@ -515,14 +516,25 @@ def launch() -> None:
         if not solver:
             messages.close()
             end_with_parent(launcher, signal.SIGKILL)
-            _serve(Connection(pipe))
+            _serve(Connection(pipe), urgent)
+        urgent = True
         os.close(pipe)
         messages.sendall(_NUMBER.pack(solver))
         messages.sendall(_NUMBER.pack(os.waitstatus_to_exitcode(os.waitpid(solver, 0)[1])))
 
 
-def _serve(pipe: Connection) -> NoReturn:
-    """Carry out requests from a pipe."""
+def _import() -> None:
+    """Import the solver's modules, with low priority."""
+    os.nice(_NICENESS)
+    with gc_paused():
+        for name in _IMPORTED:
+            import_module(name)
+
+
+def _serve(pipe: Connection, urgent: bool) -> NoReturn:
+    """Carry out requests from a pipe, with low priority, but after the first one if `urgent`."""
+    if not urgent:
+        os.nice(_NICENESS)
     requests = SimpleQueue[bytes]()
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     desk = _Desk(lambda text: pipe.send((None, text, None)))
@@ -544,6 +556,10 @@ def _serve(pipe: Connection) -> NoReturn:
         except Exception as failed:
             error = _described(failed)
         pipe.send((int.from_bytes(packed[:_LENGTH], "little"), value, error))
+        if urgent:
+            urgent = False
+            for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ("0",):
+                os.setpriority(os.PRIO_PROCESS, int(thread), _NICENESS)
 
 
 def _read(pipe: Connection, requests: SimpleQueue[bytes]) -> None:
