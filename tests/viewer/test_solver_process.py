@@ -138,6 +138,19 @@ def test_a_killed_launcher_is_started_again(untrained_weights: Path) -> None:
         assert not _runs(pid) and factory.prepare().result() == known
 
 
+def _niceness(pid: int) -> set[int]:
+    return {os.getpriority(os.PRIO_PROCESS, int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()}
+
+
+def test_all_threads_of_the_solver_have_low_priority_after_its_first_reply(untrained_weights: Path) -> None:
+    with closing(SolverProcess()) as process:
+        factory = OptimizerFactory(report=lambda text: None, requests=process, weights=(untrained_weights,))
+        for _ in range(2):
+            assert factory.prepare().result() and process.pid is not None
+            eventually(lambda: _niceness(process.pid or 0), lambda found: found == {os.nice(0) + 5})
+            _kill(process)
+
+
 def test_a_process_that_never_replies_is_started_again_only_by_a_request(untrained_weights: Path) -> None:
     with closing(SolverProcess()) as process:
         factory = OptimizerFactory(report=lambda text: None, requests=process, weights=(untrained_weights,))
