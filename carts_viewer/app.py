@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Thread
 from typing import Any, Unpack
 
 from carts_core.errors import CartsError
@@ -201,9 +202,11 @@ class ViewerApp:
         self._solver: Requests = solver or SolverProcess()
         self._optimizers = OptimizerFactory(report=self._say, requests=self._solver, **networks)
         self.tabs = Tabs(sequence, storage, renderer, self._optimizers, self._deliver, queue, folders)
-        # The first rendering compiles the visibility kernel, which takes seconds unless the kernel is cached.
         report("Preparing the renderer (takes a few seconds the first time)")
-        renderer.arm_ids(self.state.pose.scene, self.state.camera)
+        # The first rendering loads the compiled kernel or compiles it; meanwhile the page is served and loaded.
+        first = self.state.pose.scene, self.state.camera
+        self._renderer_start = Thread(target=renderer.arm_ids, args=first, name="carts-renderer")
+        self._renderer_start.start()
         self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS", proxy=proxy)
         self.url = self.page.url
         self.page.keys = key_sheet()
@@ -303,6 +306,7 @@ class ViewerApp:
             return
         self._closed = True
         self._worker.stop()
+        self._renderer_start.join()
         self._solver.listeners.remove(self._listener)
         if self._own_page:
             self.page.close()

@@ -1,3 +1,6 @@
 """The `carts` command. Slow modules are imported when a subcommand runs."""
 
-from .command_line import main as main
+from ..package_imports import gc_paused
+
+with gc_paused():
+    from .command_line import main as main
