@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
-from ..optimization.kalman import ErrorModel, Gaussian, combined
+from ..optimization.kalman import ErrorModel, Gaussian, Information, combined
 from ..optimization.observation import Backgrounds
 from ..optimization.predictor import SurfacePredictor, predictor_of
 from ..optimization.regions import ColourModel
@@ -95,6 +95,14 @@ _LOOK_AGE = 1.0
 """Age of an unfinished measurement with the network after which frames are measured with the network again [s]."""
 _LOOKED = 1.0
 """Interval between checks for an arm elsewhere in the image [s]."""
+_SETTLE, _SIGHT = "settle", "sight"
+"""Names of the solvers with `LiveSettings.settle` and `sight`, besides those of each `Effort`."""
+_NEAR = 1.75
+"""Loss of a state under a prediction from the image alone, relative to `LiveSettings.bad_loss`, above which the frame
+is not measured from this state [1]."""
+_SETTLED = 0.3
+"""Weight of the measurements before a frame that is measured with `LiveSettings.settle` [1], since they were linearized
+farther from the solution."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,22 @@ class _Attempt:
     """Time since the frame of the filtered state [s]."""
     expected: Gaussian
     """Predicted correction."""
+    measured: bool = True
+    """Whether the frame is measured; otherwise its image does not show the arms near their prediction."""
+    settles: bool = False
+    """Whether the frame is measured with `LiveSettings.settle`."""
+
+
+@dataclass
+class _Settling:
+    """Measurements since a search, and the prior that they are combined with."""
+
+    prior: Gaussian
+    """State of the error model before the search: the usual prior or the wider one, whichever is more likely."""
+    known: Information
+    """Weighted information of the frames since the search."""
+    remaining: int
+    """Number of frames that are still to be measured."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +159,11 @@ class _Look:
     """The measurement, and the colours of the frame."""
     later: list[tuple[float, Measurement]] = field(default_factory=list)
     """Timestamps [s] and measurements of later frames."""
+
+
+def _widened(state: Gaussian, factor: float) -> Gaussian:
+    """State with a scaled covariance."""
+    return Gaussian(state.mean, factor * state.covariance)
 
 
 class LiveTracker:
@@ -172,9 +201,16 @@ class LiveTracker:
         self.settings, self.live, self.verdict = settings or SurfaceSolver(), live or LiveSettings(), LiveVerdict.LOST
         self._scene, self._predictor = scene.with_cameras(cameras), predictor_of(networks)
         self._model, self._free = model or SequenceSettings(), free or FreeParameters()
+        stages: dict[str, tuple[Stage, ...]] = {
+            Effort.SMALL: self.live.small,
+            Effort.FULL: self.live.full,
+            Effort.SEARCH: self.live.search,
+            _SETTLE: self.live.settle,
+            _SIGHT: self.live.sight,
+        }
         self._solvers = {
-            (effort, moving): self._solver(stages, None if moving else backgrounds)
-            for effort, stages in ((Effort.SMALL, self.live.small), (Effort.FULL, self.live.full))
+            (name, moving): self._solver(each, None if moving else backgrounds)
+            for name, each in stages.items()
             for moving in (False, True)
         }
         self._colours = ColourTracker(self._model)
@@ -184,6 +220,13 @@ class LiveTracker:
         """State of the error model after the last good frame."""
         self._seen = -math.inf
         """Timestamp of the last good frame [s]."""
+        self._pose: list[np.ndarray] = []
+        """Joint positions of each arm in the last good frame [rad, m]."""
+        self._sees = True
+        """Whether the last image that was checked shows arms."""
+        self._settling: _Settling | None = None
+        self._loss = math.nan
+        """Loss of the last frame [1]."""
         self._searched = self._looked = -math.inf
         self._elsewhere = False
         """Whether the last check found an arm out of view and a prediction elsewhere."""
@@ -216,13 +259,14 @@ class LiveTracker:
         errors, now = self._error_model(variables), frame.timestamp or 0.0
         recovered = self._take_recovered(errors)
         self._take_look(errors)
-        attempt, measurement = self._measured(frame, variables, errors, now)
+        attempt, measurement = self._measured(frame, variables, errors, now, found_again=recovered is not None)
+        self._loss = measurement.loss
         if self._fits(attempt, measurement):
-            self._take(errors, attempt, measurement)
-            if self._look is not None and self._look.attempt is not attempt:
+            state = self._take(errors, attempt, measurement)
+            if self._look is not None and self._look.attempt.time < now:
                 self._look.later.append((now, measurement))
             self.verdict = LiveVerdict.GOOD
-            correction = combined(errors.correction(attempt.state), measurement.information)
+            correction = combined(errors.correction(state), measurement.information)
             if self._arm_is_elsewhere(frame, variables, correction.mean, measurement.loss, now):
                 self.verdict = LiveVerdict.DOUBTFUL
         else:
@@ -232,6 +276,8 @@ class LiveTracker:
         prior = errors.correction(errors.initial())
         visit = Visit(frame.frame_id, variables, measurement, Origin.WARM, 0.0)
         found = visit.estimate(self._scene, frame.index, correction, prior)
+        if self.verdict is LiveVerdict.GOOD:
+            self._pose = list(found.joint_positions.values())
         return LiveEstimate(
             frame.frame_id,
             now,
@@ -256,51 +302,123 @@ class LiveTracker:
         return self._elsewhere
 
     def _known(self, errors: ErrorModel, now: float, effort: Effort = Effort.SMALL) -> _Attempt:
-        """Predicted state for a frame; the prior for a search."""
+        """Predicted state for a frame; a wider prior for a search."""
         state, gap = errors.initial(), math.inf
-        if self._filtered is not None and effort is not Effort.SEARCH:
+        if effort is Effort.SEARCH:
+            state = _widened(state, self.live.jump**2)
+        elif self._filtered is not None:
             gap = max(now - self._seen, 1e-3)
             state = errors.predicted(self._filtered, gap)
         return _Attempt(effort, now, state, gap, errors.correction(state))
 
     def _measured(
-        self, frame: Frame, variables: Variables, errors: ErrorModel, now: float
+        self, frame: Frame, variables: Variables, errors: ErrorModel, now: float, *, found_again: bool
     ) -> tuple[_Attempt, Measurement]:
-        """Measure with the smallest sufficient effort, and start a recovery if no effort gives a good fit."""
+        """Measure with the smallest sufficient effort, and start a recovery if no effort gives a good fit.
+
+        Args:
+            found_again: whether an earlier frame was just recovered.
+        """
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
-        found = None
         self._drop_outdated(frame)
-        if self._filtered is not None or self._pool is not None:
-            attempt = self._known(errors, now)
-            if self.verdict is LiveVerdict.GOOD:
-                late = self._look is not None and now - self._look.attempt.time > _LOOK_AGE
-                overdue = self._pool is not None and self._recovery is None and not late
-                between = self._colours.measured(small, frame, variables, attempt.expected, overdue=overdue)
-                if between is not None:
-                    if overdue and self._look is None and self._colours.due:
-                        self._start_look(small, frame, variables, attempt)
-                    return attempt, between
+        attempt, found = self._known(errors, now), None
+        if self.verdict is LiveVerdict.LOST and not found_again:
+            found = self._unmeasured(frame, variables, attempt)
+        elif self.verdict is LiveVerdict.GOOD:
+            found = self._settled(frame, variables, errors, now) or self._by_colours(frame, variables, attempt)
+            if found is not None:
+                return found
+        if found is None:
             found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
             fits = self._fits(*found)
             self._colours.learn(small, frame, variables, found[1], fits)
-            if fits:
+            far = found[1].loss > _NEAR * self.live.bad_loss
+            if fits or (far and not self._is_visible(frame, variables, attempt)[0]):
                 return found
         effort = self._further(now)
-        if found and (effort is Effort.SMALL or self._recovery):
+        if effort is Effort.SMALL or self._recovery:
             return found
+        hypotheses, search = self._hypotheses(variables, attempt), self._solvers[Effort.SEARCH, self._moving]
         attempt, dropped = self._known(errors, now, effort), threading.Event()
 
         def more() -> Measurement:
             if effort is Effort.SEARCH:
-                return small.cold(frame, variables, attempt.expected, cancelled=dropped.is_set)
+                return search.search(frame, variables, attempt.expected, hypotheses, dropped.is_set)
             return full.warm(frame, variables, attempt.expected, attempt.expected.mean)
 
         if effort is Effort.SEARCH:
             self._searched = now
-        if self._pool is None or found is None:
+        if self._pool is None:
             return attempt, more()
         self._recovery = _Recovery(attempt, small_picture(frame), self._pool.submit(more), dropped)
         return found
+
+    def _unmeasured(self, frame: Frame, variables: Variables, attempt: _Attempt) -> tuple[_Attempt, Measurement] | None:
+        """Result for a frame whose arms are lost, without a measurement; None if they are visible near their
+        prediction."""
+        unmeasured = replace(attempt, measured=False)
+        nothing = Measurement(attempt.expected.mean, Information.nothing(len(variables)), self._loss, 0)
+        if self._recovery is not None and self._recovery.attempt.effort is Effort.SEARCH:
+            return unmeasured, nothing
+        visible, loss = self._is_visible(frame, variables, attempt)
+        if visible and self._filtered is not None and loss <= _NEAR * self.live.bad_loss:
+            return None
+        return unmeasured, replace(nothing, loss=loss)
+
+    def _is_visible(self, frame: Frame, variables: Variables, attempt: _Attempt) -> tuple[bool, float]:
+        """Whether an image shows arms, and the loss of the expected correction under a prediction from the image alone.
+
+        A search starts at once if arms are visible again.
+        """
+        solver = self._solvers[_SIGHT, self._moving]
+        area, loss = solver.visible(frame, variables, attempt.expected.mean)
+        before, self._sees = self._sees, area >= self.live.min_visible
+        if self._sees != before:
+            self._searched = -math.inf if self._sees else attempt.time
+        return self._sees, loss
+
+    def _settled(
+        self, frame: Frame, variables: Variables, errors: ErrorModel, now: float
+    ) -> tuple[_Attempt, Measurement] | None:
+        """Measurement of one of the frames after a search with `LiveSettings.settle`; None if the frame is none of
+        them, if this measurement runs on the separate thread, or if it does not fit."""
+        settling = self._settling
+        if settling is None or not settling.remaining or self._look is not None or self._recovery is not None:
+            return None
+        settling.remaining -= 1
+        state = errors.updated(settling.prior, settling.known)
+        state = errors.predicted(state, max(now - self._seen, 1e-3))
+        attempt = _Attempt(Effort.SMALL, now, state, math.inf, errors.correction(state), settles=True)
+        solver = self._solvers[_SETTLE, self._moving]
+        if self._pool is not None:
+            self._start_look(solver, frame, variables, attempt)
+            return None
+        found = solver.warm(frame, variables, attempt.expected, attempt.expected.mean)
+        fits = self._fits(attempt, found)
+        self._colours.learn(solver, frame, variables, found, fits)
+        return (attempt, found) if fits else None
+
+    def _by_colours(self, frame: Frame, variables: Variables, attempt: _Attempt) -> tuple[_Attempt, Measurement] | None:
+        """Measurement by colours; None if the network is needed. Starts a look of the network if it is due."""
+        small = self._solvers[Effort.SMALL, self._moving]
+        late = self._look is not None and attempt.time - self._look.attempt.time > _LOOK_AGE
+        overdue = self._pool is not None and self._recovery is None and not late
+        between = self._colours.measured(small, frame, variables, attempt.expected, overdue=overdue)
+        if between is None:
+            return None
+        if overdue and self._look is None and self._colours.due:
+            self._start_look(small, frame, variables, attempt)
+        return attempt, between
+
+    def _hypotheses(self, variables: Variables, attempt: _Attempt) -> list[np.ndarray]:
+        """Corrections of a frame if the last error persists, and if the arms have not moved since the last good frame.
+
+        A search also compares the measured values.
+        """
+        if not self._pose:
+            return []
+        still, correction = variables.joint_offsets(self._pose), attempt.expected.mean
+        return [correction, np.where(np.isnan(still), correction, still)]
 
     def _drop_outdated(self, frame: Frame) -> None:
         """Cancel a search in a frame that no longer resembles the current frame."""
@@ -317,8 +435,10 @@ class LiveTracker:
         """Next effort after a bad fit."""
         if self._filtered is not None and self.verdict is not LiveVerdict.LOST:
             return Effort.FULL
-        early = self._filtered is not None and now - self._searched < self.live.search_seconds
-        return Effort.SMALL if early else Effort.SEARCH
+        interval = 0.0 if self._filtered is None else self.live.search_seconds
+        if not self._sees:
+            interval = self.live.blind_seconds
+        return Effort.SMALL if now - self._searched < interval else Effort.SEARCH
 
     def _take_recovered(self, errors: ErrorModel) -> Effort | None:
         """Use the result of a finished recovery unless a later frame was fitted; returns the effort of a used
@@ -355,29 +475,45 @@ class LiveTracker:
         solver = self._solvers[Effort.SMALL, self._moving]
         self._colours.learn(solver, look.frame, look.variables, measurement, fits, colours)
         # A recovery or a search since then is newer.
-        if fits and self._seen == (look.later[-1][0] if look.later else look.attempt.time):
+        if fits and self._seen <= (look.later[-1][0] if look.later else look.attempt.time):
             self._take(errors, look.attempt, measurement)
             for time_, later in look.later:
                 self._take(errors, self._known(errors, time_), later)
 
     def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
         """Whether a measurement is reliable; without a filtered state, only a search is reliable."""
+        if not attempt.measured:
+            return False
         if attempt.effort is Effort.SEARCH:
-            # A search starts farther from the solution than tracking, and converges less accurately.
-            return measurement.loss <= self.live.bad_loss
+            # Without information, no arm is in view, or an arm is lost.
+            return measurement.loss <= self.live.bad_loss and bool(measurement.information.precision.any())
         usual = statistics.median(self._losses) if self._losses else math.inf
         worst = max(self.live.bad_factor * usual, 0.5 * self.live.bad_loss)
         if measurement.loss > min(self.live.bad_loss, worst):
             return False
         return self._filtered is not None and not measurement.information.contradicts(attempt.expected)
 
-    def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> None:
-        """Update the filter with a good frame, weighted for the correlation with the previous frame."""
-        share = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds)
-        self._filtered = errors.updated(attempt.state, measurement.information.scaled(share))
-        self._seen = attempt.time
-        if not measurement.by_colours:
+    def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> Gaussian:
+        """Update the filter with a good frame, weighted for the correlation with the previous frame.
+
+        Returns:
+            State of the error model before the frame.
+        """
+        share, state = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds), attempt.state
+        if attempt.effort is Effort.SEARCH:
+            usual = errors.initial()
+            likely = [measurement.information.log_likelihood(errors.correction(each)) for each in (usual, state)]
+            state = usual if likely[0] >= likely[1] else state
+            known = measurement.information.scaled(_SETTLED)
+            self._settling = _Settling(state, known, self.live.settle_frames)
+        elif attempt.settles and self._settling is not None:
+            self._settling.known = (self._settling.known + measurement.information).scaled(_SETTLED)
+        elif not measurement.by_colours:
+            # Losses of other stages are not comparable.
             self._losses.append(measurement.loss)
+        self._filtered = errors.updated(state, measurement.information.scaled(share))
+        self._seen = attempt.time
+        return state
 
     def _solver(self, warm: tuple[Stage, ...], backgrounds: Backgrounds | None) -> SequenceFrameSolver:
         model = replace(self._model, warm=warm, cold=self.live.search)

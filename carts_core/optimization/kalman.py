@@ -54,16 +54,23 @@ class Information:
         Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
         it is about 1 for a consistent measurement, and 0 if no direction is measured.
         """
+        difference, spread = self._innovation(expected)
+        return float(difference @ np.linalg.solve(spread, difference)) / max(len(difference), 1)
+
+    def log_likelihood(self, expected: Gaussian) -> float:
+        """Log likelihood of the measured directions under a prediction, up to a constant [1]."""
+        difference, spread = self._innovation(expected)
+        return -0.5 * float(difference @ np.linalg.solve(spread, difference) + np.linalg.slogdet(spread)[1])
+
+    def _innovation(self, expected: Gaussian) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
+        """Difference from a prediction in the measured directions, and its covariance."""
         residual = self.vector - self.precision @ expected.mean
         # r (L + L S L)^-1 r, with the pseudoinverse of L, which may be singular, and an S that may be 0.
         values, directions = np.linalg.eigh(self.precision)
         measured = directions[:, values > _MEASURED]
-        if not measured.shape[1]:
-            return 0.0
         L = measured.T @ self.precision @ measured
         spread = np.linalg.inv(L) + measured.T @ expected.covariance @ measured
-        difference = np.linalg.solve(L, measured.T @ residual)
-        return float(difference @ np.linalg.solve(spread, difference)) / measured.shape[1]
+        return np.linalg.solve(L, measured.T @ residual), spread
 
     def contradicts(self, expected: Gaussian) -> bool:
         """Whether the correction deviates from the prediction by three standard deviations or more, on average."""

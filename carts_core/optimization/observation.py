@@ -34,7 +34,7 @@ from ..model.scene import Scene, SceneState
 from ..recording import MeanBackground
 from ..rendering import Renderer
 from ..settings import SurfaceSolver
-from ..settings.stages import Observe
+from ..settings.stages import Given, Observe
 from ..threads import total
 from .predictor import FramePredictor
 
@@ -393,13 +393,15 @@ class Observation:
 def observe(
     images: FrameImages, predictor: FramePredictor, state: SceneState, stage: Observe, *, whole: bool = False
 ) -> Observation:
-    """Predict surface maps conditioned on a state, around its arms or in the whole image."""
+    """Predict surface maps conditioned on a state unless `stage.given` is `NOTHING`, around its arms or in the whole
+    image."""
     given = images.renderer.surface_maps(state)
     everything = whole or predictor.masked
     margin = max(images.size) if everything else round(stage.margin * images.scale)
     reach = round(stage.attention * images.scale)
     window = Window.around(given[:, COVERAGE].sum(1), margin, predictor.stride, images.size)
-    maps = predictor.predict(images.images, given, window)
+    condition = torch.zeros_like(given) if stage.given is Given.NOTHING else given
+    maps = predictor.predict(images.images, condition, window)
     if images.explained is not None:
         maps = maps * (1.0 - window.of(images.explained))
     silhouette = window.of((given[:, COVERAGE].sum(1) > 0).to(given))

@@ -21,7 +21,7 @@ from ..recording import Frame
 from ..rendering import Renderer
 from ..reprs import short_repr
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
-from ..settings.stages import COMPARE, FINEST, AlignRegions, Observe, Stage, first_observe, reduced
+from ..settings.stages import COMPARE, FINEST, AlignRegions, Descend, Observe, Stage, first_observe, reduced
 from .factors import Prior
 from .frame import base_frame_gain
 from .frame_problem import FrameProblem
@@ -30,9 +30,9 @@ from .observability import Evaluation, Uncertainty
 from .observation import Backgrounds
 from .predictor import SurfacePredictor
 from .regions import ColourModel, RegionFactor, RegionImages, align_regions
-from .stages import Fit, run_stages
+from .stages import Fit, arm_is_lost, run_stages
 from .variables import Variables
-from .verdict import Assessment, Evidence
+from .verdict import OUT_OF_VIEW, Assessment, Evidence
 
 P = ParamSpec("P")
 Found = TypeVar("Found")
@@ -41,6 +41,8 @@ Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
 _QUICK_SCALE = 1.0
 """Maximum `Observe.scale` of a quick cold start [1]."""
+_BLUR = 3.0
+"""Blur under which a prediction from the image alone is compared [px]."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,40 @@ class SequenceFrameSolver:
         """Find the correction near `start` [n]; with `wide`, use a larger margin around the arms, and more steps."""
         prior = _prior(expected, variables)
         fit = self._run(frame, variables, prior, self._wide if wide else self._warm, start)
+        return self._measurement(fit, prior)
+
+    def search(
+        self,
+        frame: Frame,
+        variables: Variables,
+        expected: Gaussian,
+        hypotheses: Sequence[np.ndarray],
+        cancelled: Callable[[], bool] = lambda: False,
+    ) -> Measurement:
+        """Find the correction with the cold stages alone; without information if an arm is lost (see `arm_is_lost`).
+
+        Args:
+            hypotheses: corrections [n] that are candidates for the start, besides the measured values.
+            cancelled: see `cold`.
+        """
+        prior, start = _prior(expected, variables), np.zeros(len(variables))
+        fit = self._run(frame, variables, prior, self._cold, start, cancelled, hypotheses)
+        found = self._measurement(fit, prior)
+        assert isinstance(fit.problem, FrameProblem)
+        return found.left_out() if arm_is_lost(fit.problem, _offsets(found.correction, variables)) else found
+
+    def visible(self, frame: Frame, variables: Variables, correction: np.ndarray) -> tuple[float, float]:
+        """Area predicted as arms in the whole image, from the image alone, relative to the rendered area at a
+        correction [n]; and the loss of the correction under this prediction [1]."""
+        problem, offsets = self._problem(frame, variables, None), _offsets(correction, variables)
+        stage = first_observe(self._settings.stages)
+        problem.observe(stage, offsets, whole=True)
+        found = problem.evaluate(offsets, Descend(blur=_BLUR), gradient=False)
+        seen = problem.observation.whole_coverage().mean()
+        return float(seen / found.silhouette.mean().clamp(min=OUT_OF_VIEW)), found.stage_loss
+
+    def _measurement(self, fit: Fit, prior: Prior) -> Measurement:
+        """Measurement at the end of a descent, with the edges if they were aligned."""
         assert fit.best_of_descent is not None
         seen = _information(fit.best_of_descent.offsets, fit.best_of_descent.evaluation, prior)
         correction = fit.best_of_descent.offsets
@@ -268,10 +304,11 @@ class SequenceFrameSolver:
         stages: tuple[Stage, ...],
         start: np.ndarray,
         cancelled: Callable[[], bool] = lambda: False,
+        hypotheses: Sequence[np.ndarray] = (),
     ) -> Fit:
         problem = self._problem(frame, variables, prior)
-        offsets = _offsets(start, variables)
-        fit = Fit(problem, offsets, self._settings.iterations)
+        offsets, further = _offsets(start, variables), tuple(_offsets(one, variables) for one in hypotheses)
+        fit = Fit(problem, offsets, self._settings.iterations, hypotheses=further)
         for _ in run_stages(stages, fit):
             if cancelled():
                 raise CancelledError

@@ -94,6 +94,8 @@ class Fit:
     """Best point of the last descent."""
     edges: Linearization | None = None
     """Quadratic model of the edge factor around the estimate, after `AlignEdges`."""
+    hypotheses: tuple[Float[Tensor, " n"], ...] = ()
+    """Further candidates of `RandomRestart`."""
     restarts: int = 0
     """Number of jumps of the estimate; after the first one, descents use a smaller tolerance."""
     used: int = 0
@@ -160,24 +162,30 @@ def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
 
 @torch.no_grad()
 def best_random_start(
-    problem: FrameProblem, offsets: Float[Tensor, " n"], stage: RandomRestart, seed: int = 0
+    problem: FrameProblem,
+    offsets: Float[Tensor, " n"],
+    stage: RandomRestart,
+    hypotheses: Sequence[Float[Tensor, " n"]] = (),
+    seed: int = 0,
 ) -> Float[Tensor, " n"]:
     """Best of random points, drawn arm by arm and compared with a new observation of the whole image.
 
     Args:
         problem: one frame; its observation is replaced by that of the whole image.
-        offsets: current estimate, which is a candidate, as is the start.
+        offsets: current estimate, which is a candidate, as are the start and `hypotheses`.
     """
     generator = torch.Generator().manual_seed(seed)
     deviation = stage.deviation * problem.prior.marginal_precision.rsqrt().cpu()
-    problem.observe(Observe(scale=stage.scale, given=Given.START, haze=False), offsets, whole=True)
+    problem.observe(Observe(scale=stage.scale, given=stage.given, haze=False), offsets, whole=True)
     best = offsets
     for group in problem.variables.groups:
         columns = list(group)
         drawn = torch.stack([torch.randn(len(group), generator=generator) for _ in range(stage.candidates + 1)])
-        trials = best.repeat(len(drawn) + 1, 1)
-        trials[1:, columns] = (drawn * deviation[columns]).to(best)
+        trials = best.repeat(len(drawn) + len(hypotheses) + 1, 1)
+        trials[1 : len(drawn) + 1, columns] = (drawn * deviation[columns]).to(best)
         trials[1, columns] = 0.0
+        for row, hypothesis in enumerate(hypotheses, len(drawn) + 1):
+            trials[row, columns] = hypothesis[columns]
         trials = problem.variables.clamp(trials)
         best = trials[problem.costs(trials, first_descend(stage.then)).argmin()]
     return best
@@ -268,7 +276,7 @@ def run_random_restart(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
     """Continue from the best of random points if the loss is high or an arm is lost."""
     problem = _one_frame(fit)
     if fit.loss >= stage.if_loss or arm_is_lost(problem, fit.offsets):
-        fit.jump_to(best_random_start(problem, fit.offsets, stage))
+        fit.jump_to(best_random_start(problem, fit.offsets, stage, fit.hypotheses))
         yield from run_stages(stage.then, fit)
 
 

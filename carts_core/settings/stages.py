@@ -14,6 +14,8 @@ class Given(StrEnum):
     """Initial state of the run."""
     ESTIMATE = "estimate"
     """The current estimate."""
+    NOTHING = "nothing"
+    """No state: the prediction from the image alone."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,8 @@ class RandomRestart(Ranged):
     `SurfaceSolver.prior_deg`) [1]."""
     scale: Annotated[float, Range(0.1, 8)] = 0.75
     """Scale of the whole image for the comparison, as in `Observe.scale` [1]."""
+    given: Given = Given.START
+    """State on which the network is conditioned."""
 
 
 @dataclass(frozen=True)
@@ -283,8 +287,27 @@ edge alignment."""
 BETWEEN: tuple[Stage, ...] = (AlignRegions(),)
 """Stage for a frame of a sequence or stream without the network."""
 
-LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
-"""Stages for a frame of a live stream with lost arms; `WARM` follows."""
+SETTLE: tuple[Stage, ...] = (Observe(), Descend(blur=0.8, steps=8, tolerance=1e-3), AlignEdges(steps=8))
+"""Stages for the frames after a search in a live stream, from the last correction to convergence."""
+
+LIVE_SEARCH: tuple[Stage, ...] = (
+    SilhouetteSearch(),
+    # The network is not conditioned on a state, since all states may be wrong.
+    RandomRestart(
+        then=(Descend(blur=16.0, robust=2.0), _COARSE, Descend(blur=3.0)),
+        candidates=16,
+        deviation=0.72,
+        given=Given.NOTHING,
+    ),
+    SETTLE[0],
+    _MEDIUM,
+    _FINE,
+    *SETTLE[1:],
+)
+"""Stages for a frame of a live stream with lost arms, under a prior that is wider than that of other frames."""
+
+SIGHT: tuple[Stage, ...] = (Observe(scale=0.5, given=Given.NOTHING, haze=False),)
+"""Observation that decides whether a frame of a live stream shows arms."""
 
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
 """Stages that compare a given state with a frame, in a smaller image."""

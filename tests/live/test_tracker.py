@@ -22,6 +22,7 @@ from carts_core.optimization import ImagePredictor
 from carts_core.optimization.sequence_frame import Measurement, SequenceFrameSolver
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
+from carts_core.settings.stages import Stage
 
 SECONDS = 0.1
 ERROR = 0.01
@@ -143,6 +144,67 @@ def test_after_an_error_that_jumps_the_arm_is_found_within_a_second(stream: Stre
     assert any(effort is Effort.SEARCH for _, effort, _ in found)
 
 
+def test_hidden_arms_are_lost_without_a_search_and_searched_in_the_first_clear_frame(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched, search = [], SequenceFrameSolver.search
+
+    def watched(*arguments: Any, **options: Any) -> Measurement:
+        searched.append(arguments[4])
+        return search(*arguments, **options)
+
+    for _ in range(3):
+        stream.next()
+    monkeypatch.setattr(SequenceFrameSolver, "search", watched)
+    last = stream.estimate.joint_positions["PSM1"]
+    stream.predictor.hidden = True
+    verdicts = [stream.next()[0] for _ in range(20)]
+    assert set(verdicts[4:]) == {LiveVerdict.LOST} and not searched
+    stream.predictor.hidden, stream.slip = False, float(np.deg2rad(4.0))
+    assert stream.next()[:2] == (LiveVerdict.GOOD, Effort.SEARCH)
+    ((error_persists, pose_persists),) = searched
+    frame = stream.sequence.frame(stream.count % 2)
+    measured = frame.measured["PSM1"]
+    np.testing.assert_allclose((measured + pose_persists)[:2], last[:2], atol=1e-5)
+    assert frame.truth is not None
+    np.testing.assert_allclose((measured + error_persists)[:2], frame.truth["PSM1"][:2], atol=np.deg2rad(0.5))
+
+
+def test_a_search_is_repeated_at_long_intervals_where_no_arm_is_seen(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched, search = [], SequenceFrameSolver.search
+
+    def watched(*arguments: Any, **options: Any) -> Measurement:
+        searched.append(stream.time)
+        return search(*arguments, **options)
+
+    stream.predictor.hidden = True
+    monkeypatch.setattr(SequenceFrameSolver, "search", watched)
+    verdicts = [stream.next()[0] for _ in range(110)]
+    assert set(verdicts) == {LiveVerdict.LOST}, "a search that finds no arm is not relied on"
+    blind = stream.tracker.live.blind_seconds
+    assert len(searched) == 2 and searched[1] - searched[0] == pytest.approx(blind, abs=SECONDS)
+
+
+def test_frames_after_a_search_are_measured_until_it_has_converged(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[tuple[Stage, ...]] = []
+    run = SequenceFrameSolver._run
+
+    def watched(solver: SequenceFrameSolver, *arguments: Any, **options: Any) -> Any:
+        used.append(arguments[3])
+        return run(solver, *arguments, **options)
+
+    monkeypatch.setattr(SequenceFrameSolver, "_run", watched)
+    for _ in range(8):
+        stream.next()
+    live = stream.tracker.live
+    assert used[: 1 + live.settle_frames] == [live.search] + [live.settle] * live.settle_frames
+    assert live.search not in used[1:] and live.settle not in used[1 + live.settle_frames :]
+
+
 def test_a_camera_that_moves_is_followed(stream: Stream) -> None:
     stream.next()
     T = np.array(stream.sequence.scene.cameras[0].T_camera_world)
@@ -170,14 +232,14 @@ def concurrent(tiny_sequence: Callable[..., Path]) -> Iterator[Stream]:
 
 def test_a_search_beside_the_stream_keeps_no_frame_waiting(concurrent: Stream, monkeypatch: pytest.MonkeyPatch) -> None:
     searching, go_on = Event(), Event()
-    cold = SequenceFrameSolver.cold
+    search = SequenceFrameSolver.search
 
     def slow(*arguments: Any, **options: Any) -> Measurement:
         searching.set()
         assert go_on.wait(60)
-        return cold(*arguments, **options)
+        return search(*arguments, **options)
 
-    monkeypatch.setattr(SequenceFrameSolver, "cold", slow)
+    monkeypatch.setattr(SequenceFrameSolver, "search", slow)
     first = [concurrent.next() for _ in range(3)]
     assert searching.wait(60), "the search has begun"
     assert [verdict for verdict, _, _ in first] == [LiveVerdict.LOST] * 3, "what was measured is not relied on"

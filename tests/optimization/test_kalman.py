@@ -104,6 +104,16 @@ def test_the_mahalanobis_distance_is_about_one_where_the_model_holds_however_muc
     assert Information.nothing(N).mahalanobis(expected) == 0
 
 
+@pytest.mark.parametrize(("errors", "wide"), [(1.0, False), (2.5, True)])
+def test_the_prior_that_errors_were_drawn_from_is_more_likely(errors: float, wide: bool) -> None:
+    usual = Gaussian(np.zeros(N), 0.035**2 * np.eye(N))
+    other = Gaussian(usual.mean, 2.5**2 * usual.covariance)
+    found = Information.known(errors * 0.035 * np.resize([1.0, -1.0], N), 0.01)
+    assert (found.log_likelihood(other) > found.log_likelihood(usual)) is wide
+    nothing = Information.nothing(N)
+    assert nothing.log_likelihood(other) == nothing.log_likelihood(usual) == 0
+
+
 def test_shares_of_correlated_errors_are_what_their_mean_becomes_certain_by() -> None:
     frames, memory, gap = 2000, 0.5, 0.25
     times = gap * np.arange(frames)

@@ -15,7 +15,7 @@ from carts_core.optimization import FreeParameters
 from carts_core.optimization.factors import FirstOrderDescent
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.observability import Evaluation
-from carts_core.optimization.stages import Fit, StopReason, run_stages, start_explains_as_well
+from carts_core.optimization.stages import Fit, StopReason, best_random_start, run_stages, start_explains_as_well
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.settings import DescentSolver, SurfaceSolver
@@ -107,6 +107,32 @@ def test_conditioning_on_start_or_estimate(tiny_sequence: Callable[..., Path], m
     list(run_stages((Observe(), Descend(8.0), Observe(given=Given.START), Observe()), fit))
     assert torch.equal(given[0], given[1])
     assert not torch.equal(given[0], given[2])
+
+
+def test_a_prediction_from_the_image_alone(tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    given, windows = [], []
+    predict = PerfectPredictor.predict
+
+    def watched(own: PerfectPredictor, images: torch.Tensor, maps: torch.Tensor, window: Window) -> torch.Tensor:
+        given.append(maps)
+        windows.append(window)
+        return predict(own, images, maps, window)
+
+    monkeypatch.setattr(PerfectPredictor, "predict", watched)
+    fit = frame_fit(tiny_sequence, Free(), np.zeros(7))
+    list(run_stages((Observe(), Observe(given=Given.NOTHING)), fit))
+    assert given[0].any() and not given[1].any()
+    assert windows[0] == windows[1], "the window is that of the estimate"
+
+
+def test_a_random_restart_compares_given_hypotheses(tiny_sequence: Callable[..., Path]) -> None:
+    off = np.deg2rad([4.0, -4.0, 0, 0, 0, 0, 0])
+    restart = RandomRestart(then=(Descend(8.0),), candidates=1)
+    fit = frame_fit(tiny_sequence, Free(), off)
+    assert isinstance(fit.problem, FrameProblem)
+    right = -torch.from_numpy(off).to(fit.offsets)
+    wrong = torch.full_like(right, 0.2)
+    assert torch.equal(best_random_start(fit.problem, fit.offsets, restart, (wrong, right)), right)
 
 
 def test_a_random_restart_happens_only_where_the_fit_is_bad(tiny_sequence: Callable[..., Path]) -> None:
