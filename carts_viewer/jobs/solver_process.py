@@ -1,18 +1,13 @@
 """The process of the solver, and its proxy in the process of the page.
 
-A launcher imports the modules of the solver, and forks the solver's process, so that another one is ready within a
-fraction of a second if it is killed. The launcher has neither Python threads nor open sessions; the thread pools of
-OpenBLAS, which it starts when it is imported, are stopped by OpenBLAS at a fork. The launcher is started with
-`subprocess`, since `multiprocessing` would import the main module of the caller. Both processes end with the page's.
-Requests and results are sent through a pipe of `multiprocessing`, of which this program owns both ends.
+The child process is started with `subprocess`, since `multiprocessing` would import the main module of the caller, and
+ends with the page's process. Requests and results are sent through a pipe of `multiprocessing`, of which this program
+owns both ends.
 """
 
-import gc
 import logging
 import os
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -25,11 +20,10 @@ from multiprocessing.connection import Connection, Pipe
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, NoReturn, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from carts_core import errors
 from carts_core.errors import CartsError
-from carts_core.package_imports import gc_paused
 from carts_core.process import return_memory, tune_process
 from carts_core.recording import Sequence
 from carts_core.stopping import end_with_parent
@@ -43,12 +37,8 @@ _LENGTH = 8
 """Length of the number before each request [bytes]."""
 _MAX_FAILURES = 3
 """Number of consecutive processes that end without a reply, after which it is started only by a request."""
-_NUMBER = struct.Struct("<i")
-"""Message of the launcher: id or exit status of a process."""
 _MEMORY_KEPT = 10.0
 """Idle time after which freed memory is returned to the operating system [s]."""
-_IMPORTED = ("carts_core.networks.extractor", "carts_core.optimization.frame", "carts_core.optimization.sequence")
-"""Modules imported by the launcher. ONNX Runtime starts a thread when it is imported, so the solver imports it."""
 _IMPORTED_LATER = ("pytorch_kinematics", "roma")
 """Modules that take a second to import (matplotlib, PyTorch's compiler), imported by the idle solver before its first
 run."""
@@ -262,7 +252,7 @@ class SolverProcess:
         self._unsent: list[bytes] = []
         self._warm_up: bytes | None = None
         self._pipe: Connection | None = None
-        self._launcher: _Launcher | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._wanted, self._closed = threading.Event(), False
         # The process ends with the thread that starts it.
         self._thread = threading.Thread(target=self._serve, name="carts-solver", daemon=True)
@@ -298,32 +288,27 @@ class SolverProcess:
         """End the process; unanswered requests fail."""
         with self._changing:
             self._closed = True
-            launcher = self._launcher
+            process = self._process
         self._wanted.set()
-        if launcher is not None:
-            launcher.kill()
+        if process is not None:
+            process.kill()
         if self._thread.ident is not None:
             self._thread.join()
 
     def _serve(self) -> None:
         """Start the process when it is needed, and receive its results."""
-        failures = 0
+        failures, urgent = 0, False
         while True:
             self._wanted.wait()
-            with self._changing:
-                if self._launcher is None and not self._closed:
-                    self._launcher = _Launcher.start()
-                launcher = self._launcher
             here, there = Pipe()
-            with there:
-                self.pid = None if launcher is None else launcher.fork(there)
-            answered = self.pid is not None and self._receive(here)
-            status = 0 if launcher is None else launcher.status()
-            failures = 0 if answered else failures + 1
+            with there, self._changing:
+                process = self._process = None if self._closed else _started(there, urgent)
+                self.pid = None if process is None else process.pid
+            answered = process is not None and self._receive(here)
+            status = 0 if process is None else process.wait()
+            failures, urgent = 0 if answered else failures + 1, True
             with self._changing:
-                if launcher is not None and launcher.ended:
-                    self._launcher = None
-                self._pipe = self.pid = None
+                self._process = self._pipe = self.pid = None
                 lost, self._waiting = list(self._waiting.values()), {}
                 self._unsent = [] if self._warm_up is None else [self._warm_up]
                 closed = self._closed
@@ -374,62 +359,18 @@ class SolverProcess:
                 listener.solver_replied()
 
 
-class _Launcher:
-    """Proxy of the process that forks the solver's process."""
-
-    def __init__(self, process: "subprocess.Popen[bytes]", messages: socket.socket) -> None:
-        self._process, self._messages = process, messages
-
-    @classmethod
-    def start(cls) -> "_Launcher | None":
-        """Start the process; None if the system cannot start it."""
-        paths = [os.path.abspath(path) for path in sys.path]
-        start = "import sys; sys.path[:] = sys.argv[3:]; from carts_viewer.jobs.solver_process import launch; launch()"
-        here, there = socket.socketpair()
-        with there:
-            try:
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", start, str(os.getpid()), str(there.fileno()), *paths],
-                    stdin=subprocess.DEVNULL,
-                    pass_fds=[there.fileno()],
-                )
-            except OSError as error:
-                _log.error("The solver process cannot be started: %s", error)
-                here.close()
-                return None
-        return cls(process, here)
-
-    @property
-    def ended(self) -> bool:
-        """Whether the process has ended."""
-        return self._process.returncode is not None
-
-    def fork(self, pipe: Connection) -> int | None:
-        """Fork a solver with one end of a pipe; returns its id, or None if this process has ended."""
-        try:
-            socket.send_fds(self._messages, [b"f"], [pipe.fileno()])
-        except OSError:
-            return None
-        return self._number()
-
-    def status(self) -> int:
-        """Wait for the end of the forked process, or of this one; returns its exit status, as `Popen.returncode`."""
-        status = self._number()
-        if status is not None:
-            return status
-        self._messages.close()
-        return self._process.wait()
-
-    def kill(self) -> None:
-        """End this process and the forked one."""
-        self._process.kill()
-
-    def _number(self) -> int | None:
-        """The next message; None if the process has ended."""
-        with suppress(OSError):
-            message = self._messages.recv(_NUMBER.size, socket.MSG_WAITALL)
-            if len(message) == _NUMBER.size:
-                return _NUMBER.unpack(message)[0]
+def _started(pipe: Connection, urgent: bool) -> "subprocess.Popen[bytes] | None":
+    """The process, with low priority after the first request if `urgent`; None if the system cannot start it."""
+    paths = [os.path.abspath(path) for path in sys.path]
+    start = "import sys; sys.path[:] = sys.argv[4:]; from carts_viewer.jobs.solver_process import serve; serve()"
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", start, str(os.getpid()), str(pipe.fileno()), str(int(urgent)), *paths],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[pipe.fileno()],
+        )
+    except OSError as error:
+        _log.error("The solver process cannot be started: %s", error)
         return None
 
 
@@ -497,46 +438,17 @@ def _by_path(sequence: Sequence) -> tuple[Any, ...]:
 ForkingPickler.register(Sequence, _by_path)
 
 
-def launch() -> None:
-    """Entry point of the launcher; its arguments are the id of the page's process and a socket."""
-    parent, descriptor = (int(text) for text in sys.argv[1:3])
+def serve() -> None:
+    """Entry point of the process; its arguments are the id of the page's process, a pipe, and whether it is urgent."""
+    parent, descriptor, urgent = (int(text) for text in sys.argv[1:4])
     end_with_parent(parent, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the page's process.
-    # On Linux, a thread has a niceness of its own, which is never decreased again.
-    importing = threading.Thread(target=_import)
-    importing.start()
-    importing.join()
-    tune_process()
-    gc.freeze()
-    urgent = False
-    messages, launcher = socket.socket(fileno=descriptor), os.getpid()
-    while (received := socket.recv_fds(messages, 1, 1))[0]:
-        (pipe,) = received[1]
-        solver = os.fork()
-        if not solver:
-            messages.close()
-            end_with_parent(launcher, signal.SIGKILL)
-            _serve(Connection(pipe), urgent)
-        urgent = True
-        os.close(pipe)
-        messages.sendall(_NUMBER.pack(solver))
-        messages.sendall(_NUMBER.pack(os.waitstatus_to_exitcode(os.waitpid(solver, 0)[1])))
-
-
-def _import() -> None:
-    """Import the solver's modules, with low priority."""
-    os.nice(_NICENESS)
-    with gc_paused():
-        for name in _IMPORTED:
-            import_module(name)
-
-
-def _serve(pipe: Connection, urgent: bool) -> NoReturn:
-    """Carry out requests from a pipe, with low priority, but after the first one if `urgent`."""
     if not urgent:
-        os.nice(_NICENESS)
+        _lower_priority()
+    pipe = Connection(descriptor)
     requests = SimpleQueue[bytes]()
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
+    tune_process()
     desk = _Desk(lambda text: pipe.send((None, text, None)))
     pipe.send((None, None, None))
     idle, later = False, list(_IMPORTED_LATER)
@@ -557,9 +469,14 @@ def _serve(pipe: Connection, urgent: bool) -> NoReturn:
             error = _described(failed)
         pipe.send((int.from_bytes(packed[:_LENGTH], "little"), value, error))
         if urgent:
-            urgent = False
-            for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ("0",):
-                os.setpriority(os.PRIO_PROCESS, int(thread), _NICENESS)
+            urgent = 0
+            _lower_priority()
+
+
+def _lower_priority() -> None:
+    """Lower the priority of all threads; on Linux, each has a niceness of its own."""
+    for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ("0",):
+        os.setpriority(os.PRIO_PROCESS, int(thread), _NICENESS)
 
 
 def _read(pipe: Connection, requests: SimpleQueue[bytes]) -> None:

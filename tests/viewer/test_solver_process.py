@@ -127,17 +127,6 @@ def _kill(process: SolverProcess) -> int:
     return pid
 
 
-def test_a_killed_launcher_is_started_again(untrained_weights: Path) -> None:
-    with closing(SolverProcess()) as process:
-        factory = OptimizerFactory(report=lambda text: None, requests=process, weights=(untrained_weights,))
-        known = factory.prepare().result()
-        pid = process.pid
-        assert pid is not None
-        os.kill(int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]), signal.SIGKILL)
-        eventually(lambda: process.pid, lambda now: now not in (None, pid), timeout=60)
-        assert not _runs(pid) and factory.prepare().result() == known
-
-
 def _niceness(pid: int) -> set[int]:
     return {os.getpriority(os.PRIO_PROCESS, int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()}
 

@@ -1,6 +1,5 @@
 """Uploads: names, limits, nothing replaced, nothing half-written, and a folder chosen in a browser."""
 
-import asyncio
 import json
 import os
 from collections.abc import Callable
@@ -11,8 +10,9 @@ import pytest
 from playwright.sync_api import Browser, FloatRect, Page, expect
 from viewer_tab import box_of, new_context
 from waiting import eventually
-from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from carts_core.errors import CartsError, SettingsError
 from carts_viewer.start import uploads
@@ -85,24 +85,24 @@ def test_only_the_start_page_accepts_uploads_of_its_own_origin(tmp_path: Path) -
     root = tmp_path / "labs"
     root.mkdir()
 
-    async def offered(url: str, *messages: str | bytes, origin: str | None = None) -> list[dict[str, str]]:
-        async with connect(f"{url.replace('http', 'ws')}/upload", origin=origin, compression=None) as connection:  # type: ignore[arg-type]
+    def offered(url: str, *messages: str | bytes, origin: Origin | None = None) -> list[dict[str, str]]:
+        with connect(f"{url.replace('http', 'ws')}/upload", origin=origin, compression=None) as connection:
             answers = []
             for message in messages:
-                await connection.send(message)
-                answers.append(json.loads(await asyncio.wait_for(connection.recv(), 30)))
+                connection.send(message)
+                answers.append(json.loads(connection.recv(30)))
             return answers
 
     with Site([root], port=0) as site:
         site.wait()
         with pytest.raises(InvalidStatus):
-            asyncio.run(offered(site.url, origin="http://evil.example"))
+            offered(site.url, origin=Origin("http://evil.example"))
         listing = json.dumps({"files": [["a/x.bin", 3]]})
-        assert asyncio.run(offered(site.url, listing, b"123")) == [{"received": 0}, {"folder": str(root / "a")}]
-        assert "error" in asyncio.run(offered(site.url, "{}"))[0]
-        assert "error" in asyncio.run(offered(site.url, listing, "text"))[1]
+        assert offered(site.url, listing, b"123") == [{"received": 0}, {"folder": str(root / "a")}]
+        assert "error" in offered(site.url, "{}")[0]
+        assert "error" in offered(site.url, listing, "text")[1]
         # A lost connection leaves nothing.
-        asyncio.run(offered(site.url, listing))
+        offered(site.url, listing)
         eventually(lambda: [entry.name for entry in root.iterdir()] == ["a"])
 
 
