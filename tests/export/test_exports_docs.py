@@ -22,4 +22,4 @@ def test_the_example_runs(tiny_sequence: Callable[..., Path], monkeypatch: pytes
     monkeypatch.chdir(folder)
     (example,) = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
     exec(example, {})
-    assert len(COCO(str(folder / "out" / "annotations" / "instances_default.json")).imgs) == 3
+    assert len(COCO(str(folder / "exported" / "annotations" / "instances_default.json")).imgs) == 3

@@ -92,9 +92,10 @@ def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
 def test_the_recording_is_shown_again_if_the_solver_process_ends(app: ViewerApp) -> None:
     app.queue.put(intents.StartLive("replay", rate=10.0, repeat=True))
     eventually(lambda: app.state.live, lambda live: live is not None and live.on and not live.busy, SECONDS)
+    # The solvers of other viewers of this test run may run as well; the newest is this viewer's.
     running = (child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE)
-    (solver,) = (child for child in running if "serve()" in " ".join(child.cmdline()))
-    solver.kill()
+    solvers = [child for child in running if "serve()" in " ".join(child.cmdline())]
+    max(solvers, key=lambda child: child.create_time()).kill()
     eventually(lambda: app.state.error or "", lambda error: "ended unexpectedly (SIGKILL" in error, SECONDS)
     eventually(lambda: app.state.streaming, lambda on: not on)
     assert app.state.frame.frame_id == app.sequence.frame_ids[0]
