@@ -207,13 +207,13 @@ def measure_engines(jobs: int) -> None:
         print(f"  {name}, {done} jobs: {seconds:.2f} s, processor {processor:.2f} s, {memory:.0f} MB", flush=True)
 
 
-def measure_gain(jobs: int, times: int) -> None:
+def measure_gain(jobs: int, times: int, recording: Path) -> None:
     """Print how much faster two workers process jobs than one, relative to two plain commands in parallel."""
     plain: list[tuple[float, float]] = []
     batch: list[tuple[float, float]] = []
     for _ in range(times):
         with tempfile.TemporaryDirectory() as name:
-            manifest, sequence = Path(name) / "archive.toml", str(sample_sequence())
+            manifest, sequence = Path(name) / "archive.toml", str(recording.resolve())
             table = f'[[jobs]]\nrecordings = ["{sequence}"]\nsteps = ["sequence"]\n'
             manifest.write_text(f'format = "carts-batch/1"\n{jobs * table}')
             for in_batch, rows in ((False, plain), (True, batch)):
@@ -270,11 +270,12 @@ def main() -> None:
     parser.add_argument("--code", type=Path, nargs="+", default=[Path(__file__).parents[1]])
     parser.add_argument("--no-page", action="store_true")
     parser.add_argument("--engines", action="store_true")
+    parser.add_argument("--recording", type=Path, default=sample_sequence(), help="recording of the jobs of --gain")
     parser.add_argument("--gain", type=int, metavar="JOBS", help="only measure two workers against two plain commands")
     arguments = parser.parse_args()
     if arguments.gain:
         print(f"{arguments.gain} jobs, load {os.getloadavg()[0]:.1f}", flush=True)
-        return measure_gain(arguments.gain, arguments.times)
+        return measure_gain(arguments.gain, arguments.times, arguments.recording)
     with tempfile.TemporaryDirectory() as name:
         codes = []
         for number, checkout in enumerate(arguments.code):

@@ -8,12 +8,14 @@ A long run also measures drift: memory and latency of its first and its last ten
 import argparse
 import json
 import os
+from collections import Counter, deque
 from dataclasses import replace
 
 import numpy as np
 
 from carts_core.evaluation import dice
-from carts_core.live import LiveStatistics, LiveTracker, Replay, follow
+from carts_core.live import LiveStatistics, LiveTracker, LiveVerdict, Replay, follow
+from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds
 from carts_core.process import tune_process
@@ -23,7 +25,9 @@ from carts_core.resources import sample_sequence
 from tools.memory import resident_megabytes
 
 _WARM_UP = 20
-"""Number of initial results that are ignored, during the compilation of kernels and the search for the arms."""
+"""Number of initial results without times, during the compilation of kernels and the search for the arms."""
+_SCORED = 500
+"""Number of last good results whose masks are compared."""
 
 
 def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, object]:
@@ -34,17 +38,20 @@ def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, o
     extractor = FeatureExtractor.load(inference="onnx")
     backgrounds = Backgrounds.of(sequence, (camera,), domain)
     tracker = LiveTracker(scene, extractor, backgrounds=backgrounds, cameras=(camera,), concurrent=True)
-    renderer, memory, scores, states = Renderer(scene, cameras=[camera]), [], [], {}
+    renderer, memory, scores = Renderer(scene, cameras=[camera]), [], []
+    recent: deque[tuple[str, SceneState]] = deque(maxlen=_SCORED)
     ages: list[float] = []
     ends: list[float] = []
+    verdicts: list[LiveVerdict] = []
 
     def take(tracked) -> None:
         ends.append(tracked.estimate.time + tracked.age)
         ages.append(1e3 * tracked.age)
         if len(ages) % 100 == 0:
             memory.append(resident_megabytes())
-        states[len(states)] = tracked.estimate.frame_id, tracked.estimate.state
-        states.pop(len(states) - 500, None)
+        if tracked.estimate.verdict is LiveVerdict.GOOD:
+            recent.append((tracked.estimate.frame_id, tracked.estimate.state))
+        verdicts.append(tracked.estimate.verdict)
 
     statistics = LiveStatistics()
     loops = round(seconds * rate / len(sequence))
@@ -52,12 +59,14 @@ def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, o
         follow(Replay(sequence, (camera,), domain, rate=rate, loops=loops), tracker, [take], statistics)
     finally:
         tracker.close()
-    for frame_id, state in list(states.values())[_WARM_UP:]:
+    for frame_id, state in recent:
         index = sequence.frame_ids.index(frame_id)
         masks = sequence.frame(index, domain, (camera,)).masks
         assert masks is not None
         if arms == len(sequence.scene.arms):
             scores.append(dice(renderer.segment(state)[0] >= 0, masks[camera]))
+    first = verdicts.index(LiveVerdict.GOOD) if LiveVerdict.GOOD in verdicts else len(verdicts)
+    found_after = ends[min(first, len(ends) - 1)] - (ends[0] - ages[0] / 1e3)
     del ages[:_WARM_UP], ends[:_WARM_UP]
     tenth = max(len(ages) // 10, 1)
     return {
@@ -70,7 +79,11 @@ def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, o
         "memory_mb_first_last": [round(value, 1) for value in (memory[len(memory) // 10], memory[-1])]
         if memory
         else [],
-        "verdicts": {str(verdict): count for verdict, count in statistics.verdicts.items()},
+        "first_good_after_s": round(found_after, 2),
+        "verdicts_before_and_after": [
+            {str(verdict): count for verdict, count in Counter(part).items()}
+            for part in (verdicts[:first], verdicts[first:])
+        ],
         "dice": round(float(np.mean(scores)), 4) if scores else None,
     }
 

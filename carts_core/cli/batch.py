@@ -20,7 +20,6 @@ from .options import RangedOptions, output_folder
 if TYPE_CHECKING:
     from ..batch.manifest import Job
     from ..files import OutputPath
-    from ..settings.optimization import Engine
 
 _BETWEEN_SUMMARIES = 1.0
 """Minimum interval between updates of throughput and cost [s]."""
@@ -69,11 +68,12 @@ class Batch(RangedOptions):
                 check_options(jobs)
             write_jobs(folder, jobs)
         failed: dict[str, str] = {}
-        if not self.report_only:
-            failed = self._run(console, chosen, folder)
-        if len(chosen) == len(jobs):
-            console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
-        else:
+        with message_if_stopped(f"{folder} holds the finished jobs; rerun the command to resume"):
+            if not self.report_only:
+                failed = self._run(console, chosen, folder)
+            if len(chosen) == len(jobs):
+                console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
+        if len(chosen) < len(jobs):
             console.print("this shard is done; after the last shard, write the report with --report-only")
         console.print(f"to inspect the results: carts view {folder}")
         if failed:
@@ -93,7 +93,7 @@ class Batch(RangedOptions):
         from ..package_imports import require_package
         from .batch_job import BatchWork, with_project
 
-        work = BatchWork(folder, self.again, _inference(folder), self.project)
+        work = BatchWork(folder, self.again, project=self.project)
         workers = min(self.workers or os.cpu_count() or 1, len(jobs))
         if self.scheduler is None:
             engine = Pool(work, workers, self.threads)
@@ -107,9 +107,8 @@ class Batch(RangedOptions):
             console.print(f"{counts_of} (see the logs). To use the measured joints: --project none")
         failed, counts, done = {}, Counter(), []
         began, shown = time.monotonic(), -math.inf
-        kept = f"{folder} holds the finished jobs; rerun the command to resume"
         columns = Bar.get_default_columns()[:-1]  # The last one estimates the remaining time from jobs done earlier.
-        with message_if_stopped(kept), Bar(*columns, console=console) as bar:
+        with Bar(*columns, console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
             for outcome in engine.run(jobs):
                 counts[outcome.status] += 1
@@ -135,19 +134,3 @@ class Batch(RangedOptions):
             )
             console.print(f"estimates for these jobs: {cost.forecast()}")
         return failed
-
-
-def _inference(folder: "OutputPath") -> "Engine":
-    """Inference engine of all jobs: the faster engine on the machine that started the batch."""
-    from ..files import holds_file, write_new
-    from ..files.reading import SETTINGS, read_text
-    from ..process import tune_process
-
-    path = folder / "inference.txt"
-    if not holds_file(path):
-        # Imported here, because it imports PyTorch, which a resumed batch does not need.
-        from ..networks.extractor import FeatureExtractor
-
-        tune_process()
-        write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
-    return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"
