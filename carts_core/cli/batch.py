@@ -57,7 +57,6 @@ class Batch(RangedOptions):
         from ..batch.folder import write_jobs
         from ..batch.manifest import read_manifest, shard
         from ..batch.report import write_batch_report
-        from .batch_job import check_options
 
         console = Terminal()
         folder = output_folder(self.output, "batch", self.manifest.stem)
@@ -65,6 +64,8 @@ class Batch(RangedOptions):
             jobs = read_manifest(self.manifest, folder.path)
             chosen = shard(jobs, self.shard)
             if not self.report_only:
+                from .batch_job import check_options  # Imports all commands.
+
                 check_options(jobs)
             write_jobs(folder, jobs)
         failed: dict[str, str] = {}

@@ -5,9 +5,10 @@ import io
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import reduce
+from importlib import import_module
 from importlib.metadata import version
 from operator import or_
 from typing import Annotated, Any, get_args
@@ -17,24 +18,16 @@ import tyro
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..package_imports import gc_paused
-from ..settings import DescentSolver, SequenceSettings, SurfaceSolver
-from ..settings.serialization import described
-from ..settings.stages import Stage
 from ..stopping import PARENT, end_with_parent, exit_status, message, stopped_by_signals
 from ..wording import closest
-from .batch import Batch
-from .calibrate import Calibrate, HandEye, TimeOffset
-from .export import Export, Render
-from .importing import Import, ImportMasks
-from .lab import Baseline, Bench, BenchDataSet, DataSet, Synthesize, Train
-from .live import Live
-from .optimize import Evaluate, Optimize
-from .robots import RobotCommand, Robots
-from .view import View
 
 
 def settings_reference() -> str:
     """Description of all settings of a settings file, with defaults and meanings."""
+    from ..settings import DescentSolver, SequenceSettings, SurfaceSolver
+    from ..settings.serialization import described
+    from ..settings.stages import Stage
+
     parts = [
         "Settings in the tables [solver] and [sequence] of `--settings FILE`; --print-settings writes all of them.",
         *(described(kind) for kind in (SurfaceSolver, DescentSolver, SequenceSettings)),
@@ -53,32 +46,50 @@ _DESCRIPTION = (
 BAD_INPUT = 2
 """Exit status for an invalid file or option."""
 
-COMMANDS: dict[str, type] = {
-    "view": View,
-    "import": Import,
-    "import-masks": ImportMasks,
-    "hand-eye": HandEye,
-    "time-offset": TimeOffset,
-    "optimize": Optimize,
-    "live": Live,
-    "evaluate": Evaluate,
-    "calibrate": Calibrate,
-    "render": Render,
-    "export": Export,
-    "batch": Batch,
-    "robot": RobotCommand,
-    "robots": Robots,
-    "synthesize": Synthesize,
-    "train": Train,
-    "baseline": Baseline,
-    "bench": Bench,
+COMMANDS = {
+    "view": ("view", "View"),
+    "import": ("importing", "Import"),
+    "import-masks": ("importing", "ImportMasks"),
+    "hand-eye": ("calibrate", "HandEye"),
+    "time-offset": ("calibrate", "TimeOffset"),
+    "optimize": ("optimize", "Optimize"),
+    "live": ("live", "Live"),
+    "evaluate": ("optimize", "Evaluate"),
+    "calibrate": ("calibrate", "Calibrate"),
+    "render": ("export", "Render"),
+    "export": ("export", "Export"),
+    "batch": ("batch", "Batch"),
+    "robot": ("robots", "RobotCommand"),
+    "robots": ("robots", "Robots"),
+    "synthesize": ("lab", "Synthesize"),
+    "train": ("lab", "Train"),
+    "baseline": ("lab", "Baseline"),
+    "bench": ("lab", "Bench"),
 }
-"""Subcommand -> dataclass with its options and `run` method."""
-
-Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
-
-_AT_ONCE = (View, Live, RobotCommand, Robots)
+"""Subcommand -> module and dataclass with its options and `run` method. Only the module of the given subcommand is
+imported."""
+_AT_ONCE = ("view", "live", "robot", "robots")
 """Commands that do not announce their start."""
+_WITHOUT_TORCH = ("view", "batch")
+"""Commands that import PyTorch only to solve."""
+
+
+def command_class(name: str, options: Sequence[str] = ()) -> Any:
+    """Dataclass of a subcommand with these options."""
+    if name == "bench" and options:
+        from .lab import BenchDataSet, DataSet
+
+        if options[0] in get_args(DataSet):
+            return BenchDataSet
+    module, kind = COMMANDS[name]
+    return getattr(import_module(f".{module}", __package__), kind)
+
+
+def _any_command() -> Any:
+    """Union of all subcommands."""
+    return reduce(or_, (Annotated[command_class(name), tyro.conf.subcommand(name)] for name in COMMANDS))
+
+
 _INVALID_CHOICE = re.compile(r"invalid choice '(?P<given>[^']*)' for .*?Expected one of \((?P<known>[^)]*)\)")
 """Pattern of tyro's error message, without the surrounding box."""
 
@@ -97,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
             if "--help-all" in arguments:
                 shown = [argument if argument != "--help-all" else "--help" for argument in arguments]
                 with contextlib.suppress(SystemExit):
-                    tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
+                    tyro.cli(_any_command(), prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
                 print(settings_reference())
                 return
             arguments = [argument for argument in arguments if argument != "--print-settings"]
@@ -108,15 +119,14 @@ def main(arguments: list[str] | None = None) -> None:
                     raise SettingsError(f"--print-settings is available for {named}.")
                 print(command.solving.printed())
                 return
-        if not isinstance(command, _AT_ONCE):
+        if arguments[0] not in _AT_ONCE:
             # The imports may take seconds on a busy machine.
             Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
         with gc_paused():
             from ..process import keep_memory, tune_process
 
         log_to_stderr()
-        # The viewer and a batch import PyTorch only to solve.
-        keep_memory() if isinstance(command, (View, Batch)) else tune_process()
+        keep_memory() if arguments[0] in _WITHOUT_TORCH else tune_process()
         with stopped_by_signals():
             command.run()
     except CartsError as error:
@@ -138,9 +148,8 @@ def _parsed(arguments: list[str]) -> Any:
         with contextlib.redirect_stderr(said):
             if name in COMMANDS:
                 # For a misspelt option, suggest only options of the same command.
-                data_set = name == "bench" and options[:1] and options[0] in get_args(DataSet)
-                return tyro.cli(BenchDataSet if data_set else COMMANDS[name], prog=f"carts {name}", args=options)
-            return tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
+                return tyro.cli(command_class(name, options), prog=f"carts {name}", args=options)
+            return tyro.cli(_any_command(), prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
     except SystemExit:
         print(said.getvalue(), end="", file=sys.stderr)
         if found := _INVALID_CHOICE.search(" ".join(said.getvalue().replace("│", " ").split())):

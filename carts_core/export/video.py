@@ -3,7 +3,6 @@
 from contextlib import ExitStack
 from fractions import Fraction
 
-import av
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -49,6 +48,8 @@ _QUALITY = {"crf": "18", "preset": "medium"}
 
 def write_video(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write `CAMERA.mp4` for every camera."""
+    import av  # noqa: PLC0415  Not needed by other exports.
+
     rate = Fraction(frame_rate(dataset)).limit_denominator(1001)
     cameras = dataset.scene.cameras
     names = unique_file_names([camera.name for camera in cameras])

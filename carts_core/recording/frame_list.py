@@ -18,7 +18,6 @@ from ..files.reading import MAX_NAME_LENGTH, check_path, is_regular
 from ..wording import closest, counted, shown
 from .kinematics_table import Table, read_table
 from .toml_table import TomlTable, check_file_name
-from .video import index_video
 
 _WIDTH_DIGITS = 6
 _PLACEHOLDERS = ("frame", "index", "domain", "camera")
@@ -197,6 +196,8 @@ def _frames_of_video(section: TomlTable) -> FrameList:
                 key, "cannot be combined with `video`, since all frames of the video are used. Remove one."
             )
     pattern = _take_pattern(section)
+    from .video import index_video  # noqa: PLC0415  It imports PyAV.
+
     index = index_video(path)
     if index.timestamps is None:
         raise section.error(

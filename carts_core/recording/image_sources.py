@@ -24,6 +24,8 @@ from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of ROS bags; a folder with `metadata.yaml` is also a bag."""
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ogv")
+"""Suffixes of video files."""
 
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),

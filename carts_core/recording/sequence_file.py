@@ -26,12 +26,11 @@ from ..model.robot import Robot
 from ..model.scene import Arm, Light, Scene
 from ..wording import closest, counted, listed, shown
 from .frame_list import FrameList, check_present, expand, frame_files, is_glob, is_per_frame, numbers_of_frames
-from .image_sources import BagImages, Cropped
+from .image_sources import VIDEO_SUFFIXES, BagImages, Cropped
 from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
 from .kinematics_table import take_joints
 from .matching import Rows, Samples, TimeMatching, take_camera_motion, take_rows
 from .toml_table import TomlTable, check_file_name, read_toml
-from .video import SUFFIXES, Video
 
 
 def take_value(table: TomlTable, key: str, default: Any) -> Any:
@@ -249,12 +248,14 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
         numbers = numbers_of_frames(frames.table, video_frame, table.name("video_frame"))
     if not is_per_frame(pattern) and not is_glob(pattern):
         path = _path(table, "images", pattern, domain, camera)
-        if path.suffix.lower() not in SUFFIXES:
+        if path.suffix.lower() not in VIDEO_SUFFIXES:
             raise table.error(
                 "images",
                 f"is {pattern!r}, which is the same for every frame. Add {{frame}}, or name a video "
-                f"({', '.join(SUFFIXES)}).",
+                f"({', '.join(VIDEO_SUFFIXES)}).",
             )
+        from .video import Video  # noqa: PLC0415  It imports PyAV.
+
         return Video(path, numbers, deinterlace=deinterlace)
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
     if sparse:

@@ -218,9 +218,6 @@ def _remedy(path: Path) -> str:
     return f"Convert it with `ffmpeg -i {path.name} -c:v libx264 -crf 12 converted.mp4`, or into a folder of images."
 
 
-SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ogv")
-"""Suffixes of video files."""
-
 _BOTTOM_FIRST = (3, 4)
 """FFmpeg's field orders with the bottom field first: BB and TB."""
 _ONE = 2**16

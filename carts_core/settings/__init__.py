@@ -3,6 +3,9 @@
 No module of this package imports torch, so that the command line starts quickly.
 """
 
+from typing import TYPE_CHECKING
+
+from ..package_imports import names_on_first_use
 from .interchange import ANNOTATION_FORMATS as ANNOTATION_FORMATS
 from .interchange import AnnotationFormat as AnnotationFormat
 from .interchange import FormatName as FormatName
@@ -32,20 +35,49 @@ from .stages import PreferStart as PreferStart
 from .stages import RandomRestart as RandomRestart
 from .stages import RejectFailed as RejectFailed
 from .stages import Stage as Stage
-from .synthesis import DOMAINS as DOMAINS
-from .synthesis import DomainConfig as DomainConfig
-from .synthesis import EndoscopeConfig as EndoscopeConfig
-from .synthesis import MeasurementError as MeasurementError
-from .synthesis import MotionConfig as MotionConfig
-from .synthesis import RenderConfig as RenderConfig
-from .synthesis import SensorConfig as SensorConfig
-from .synthesis import SynthesisConfig as SynthesisConfig
-from .training import DARKEST_BRIGHTNESS as DARKEST_BRIGHTNESS
-from .training import AppearanceRanges as AppearanceRanges
-from .training import Architecture as Architecture
-from .training import ImageSettings as ImageSettings
-from .training import NetworkName as NetworkName
-from .training import ObjectiveWeights as ObjectiveWeights
-from .training import SurfaceArchitecture as SurfaceArchitecture
-from .training import SurfaceWeights as SurfaceWeights
-from .training import TrainingConfig as TrainingConfig
+
+if TYPE_CHECKING:
+    from .synthesis import DOMAINS as DOMAINS
+    from .synthesis import DomainConfig as DomainConfig
+    from .synthesis import EndoscopeConfig as EndoscopeConfig
+    from .synthesis import MeasurementError as MeasurementError
+    from .synthesis import MotionConfig as MotionConfig
+    from .synthesis import RenderConfig as RenderConfig
+    from .synthesis import SensorConfig as SensorConfig
+    from .synthesis import SynthesisConfig as SynthesisConfig
+    from .training import DARKEST_BRIGHTNESS as DARKEST_BRIGHTNESS
+    from .training import AppearanceRanges as AppearanceRanges
+    from .training import Architecture as Architecture
+    from .training import ImageSettings as ImageSettings
+    from .training import NetworkName as NetworkName
+    from .training import ObjectiveWeights as ObjectiveWeights
+    from .training import SurfaceArchitecture as SurfaceArchitecture
+    from .training import SurfaceWeights as SurfaceWeights
+    from .training import TrainingConfig as TrainingConfig
+
+__getattr__, __dir__ = names_on_first_use(
+    __name__,
+    {
+        "synthesis": (
+            "DOMAINS",
+            "DomainConfig",
+            "EndoscopeConfig",
+            "MeasurementError",
+            "MotionConfig",
+            "RenderConfig",
+            "SensorConfig",
+            "SynthesisConfig",
+        ),
+        "training": (
+            "DARKEST_BRIGHTNESS",
+            "AppearanceRanges",
+            "Architecture",
+            "ImageSettings",
+            "NetworkName",
+            "ObjectiveWeights",
+            "SurfaceArchitecture",
+            "SurfaceWeights",
+            "TrainingConfig",
+        ),
+    },
+)

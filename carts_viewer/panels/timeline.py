@@ -22,7 +22,6 @@ from carts_core.project.state import Record
 from carts_core.project.values import VERDICTS, WHOLE_PROJECT
 from carts_core.recording import Frame, Sequence
 from carts_core.recording.images import ImageSource
-from carts_core.recording.video import Video
 from carts_core.rendering import ImageRenderer
 from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, review_name
 from carts_viewer.panels.inputs import humanized
@@ -158,7 +157,8 @@ class Thumbnails:
         """Recorded images of a camera and domain; videos get a separate reader."""
         if (camera, domain) not in self._sources:
             source = self._sequence.image_source(self._cameras[camera], self._sequence.domains[domain])
-            self._sources[camera, domain] = source.another() if isinstance(source, Video) else source
+            another = getattr(source, "another", None)
+            self._sources[camera, domain] = source if another is None else another()
         return self._sources[camera, domain]
 
     def _find(self, path: str) -> bytes | None:

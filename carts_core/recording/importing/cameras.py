@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.camera import implausible_intrinsics
+from ..image_sources import VIDEO_SUFFIXES
 from ..images import ImageFiles, bits_remark, image_remarks, is_deep
-from ..video import SUFFIXES, Video, index_video
+from ..video import Video, index_video
 from .calibrations import Calibration, calibration_from_info, read_calibration
 from .found import FoundCamera, Import, PartError
 
@@ -230,7 +231,7 @@ def image_files(folder: Path) -> list[Path]:
 
 def find_images(path: Path, only: str = "") -> Images:
     """Find the frames of a video, or of a folder of images whose names end with `only`."""
-    if path.is_file() and path.suffix.lower() in SUFFIXES:
+    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         index = index_video(path)
         if not index.count:
             raise SequenceError(f"video {path} has no frames. Copy it again.")

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from ...errors import SequenceError
-from ..image_sources import Bag
+from ..image_sources import VIDEO_SUFFIXES, Bag
 from ..importing.cameras import calibration_of, files_with, find_images, side_of
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
 from ..importing.found import FoundCamera, FoundRecording, Import, Source, Track, read_json, well_formed
 from ..importing.logs import ArmLog, arm_from_log, nearest, track
-from ..video import SUFFIXES
 from .bag import read_arm_logs, read_endoscope
 
 _SIDES = {"LR": ("left", "right"), "RL": ("right", "left")}
@@ -49,11 +48,11 @@ def _detect(path: Path) -> bool:
         return False
     if (path / "index.json").is_file():
         return True
-    return any((video.with_suffix(".json")).is_file() for video in files_with(path, SUFFIXES))
+    return any((video.with_suffix(".json")).is_file() for video in files_with(path, VIDEO_SUFFIXES))
 
 
 def _streams(path: Path, job: Import) -> list[_Stream]:
-    videos = files_with(path, SUFFIXES)
+    videos = files_with(path, VIDEO_SUFFIXES)
     if (path / "index.json").is_file():
         index = read_json(path / "index.json")
         listed = index.get("videos") if isinstance(index, dict) else None

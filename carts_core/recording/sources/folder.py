@@ -9,6 +9,7 @@ import numpy as np
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.interchange import NO_TABLE, ImportOptions
+from ..image_sources import VIDEO_SUFFIXES
 from ..importing.cameras import (
     Images,
     cameras_of,
@@ -24,7 +25,6 @@ from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreig
 from ..importing.found import FoundArm, FoundRecording, Import, PartError, Source
 from ..importing.logs import arm_from_log
 from ..importing.row_matching import FrameTimes, RowMatch, by_rows, frame_times, match_rows, row_seconds
-from ..video import SUFFIXES
 
 _DEPTH = 2
 _NOT_IMAGES = ("mask", "label", "segment", "ground_truth", "annot", "depth")
@@ -55,7 +55,7 @@ def tables_of(path: Path) -> list[Path]:
 
 def _image_places(path: Path) -> list[Path]:
     """Videos and folders of images, excluding masks and similar folders."""
-    places = [folder for folder in _folders(path) if image_files(folder)] + _files(path, SUFFIXES)
+    places = [folder for folder in _folders(path) if image_files(folder)] + _files(path, VIDEO_SUFFIXES)
     return [
         place
         for place in places
