@@ -23,8 +23,18 @@ def as_array(values: Array) -> np.ndarray:
     return np.ascontiguousarray(values if isinstance(values, np.ndarray) else values.detach().cpu().numpy())
 
 
-def converted(values: np.ndarray, like: Array) -> Array:
-    """Convert an array to the library, device and data type of `like`."""
+def array_if_faster(values: Array) -> Array:
+    """The array of a tensor on the CPU without gradients, because small operations are faster in NumPy; its memory is
+    shared. Other tensors, and arrays, are unchanged."""
+    if isinstance(values, np.ndarray) or values.requires_grad or values.device.type != "cpu":
+        return values
+    return values.numpy()
+
+
+def converted(values: Array, like: Array) -> Array:
+    """Convert an array to the library, device and data type of `like`; tensors are unchanged."""
+    if not isinstance(values, np.ndarray):
+        return values
     if isinstance(like, np.ndarray):
         return values.astype(like.dtype, copy=False)
     return library(like).from_numpy(values).to(like)

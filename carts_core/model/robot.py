@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from jaxtyping import Float
 
-from ..arrays import Array, converted, library
+from ..arrays import Array, array_if_faster, converted, library
 from ..errors import RobotError
 from ..files.reading import ROBOT, is_regular, read_text
 from ..reprs import short_repr
@@ -231,12 +231,13 @@ class Kinematics:
         for name in link_names:
             if name not in self._frame_index:
                 raise RobotError(f"the robot has no link {shown(name)}. Its links: {listed(self._frame_index)}.")
-        of, q = library(joint_positions), joint_positions.reshape(-1, dofs)
+        given = array_if_faster(joint_positions)
+        of, q = library(given), given.reshape(-1, dofs)
         double = q.astype(np.float64) if of is np else q.double()
         Ts_root = self._Ts_root(double)
         Ts_root_link = of.stack([Ts_root[self._frame_index[name]] for name in link_names], 1)
         Ts = (converted(self._T_base_root, double) @ Ts_root_link).reshape(*joint_positions.shape[:-1], -1, 4, 4)
-        return Ts.astype(joint_positions.dtype) if of is np else Ts.to(joint_positions.dtype)
+        return converted(Ts, joint_positions) if of is np else Ts.to(joint_positions.dtype)
 
 
 def _from_root(links: list[str], above: Mapping[str, _Joint]) -> list[str]:

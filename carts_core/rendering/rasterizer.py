@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..arrays import Array, as_array, library
+from ..arrays import Array, array_if_faster, as_array, converted, library
 from ..compiled import compiled
 from ..model.parts import link_parts
 from ..model.robot import Robot
@@ -309,10 +309,11 @@ def vertices_in_camera(
     geometry: SceneGeometry, Ts_camera_link: Float[Array, "*batch links 4 4"]
 ) -> Float[Array, "*batch 3 V"]:
     """Positions of all vertices in the frame of a camera [m]."""
-    ends, Ts = accumulate(geometry.vertex_counts), Ts_camera_link
-    parts = [geometry.vertices[:, end - count : end] for count, end in zip(geometry.vertex_counts, ends, strict=True)]
+    ends, Ts = accumulate(geometry.vertex_counts), array_if_faster(Ts_camera_link)
+    vertices = as_array(geometry.vertices) if library(Ts) is np else geometry.vertices
+    parts = [vertices[:, end - count : end] for count, end in zip(geometry.vertex_counts, ends, strict=True)]
     moved = [Ts[..., link, :3, :3] @ part + Ts[..., link, :3, 3:] for link, part in enumerate(parts)]
-    return library(Ts).concatenate(moved, -1)
+    return converted(library(Ts).concatenate(moved, -1), Ts_camera_link)
 
 
 def unit(vectors: Float[Array, "3 K"]) -> Float[Array, "3 K"]:
@@ -451,15 +452,17 @@ class VisiblePoints:
 
     def transformed(self, Ts_camera_link: Float[Array, "views links 4 4"]) -> tuple[Array, Array]:
         """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
-        moved, turned = [], []
-        for view, link, run in self.runs():
-            T = Ts_camera_link[view, link]
-            moved.append(T[:3, :3] @ self.point_link[:, run] + T[:3, 3:])
-            turned.append(T[:3, :3] @ self.normal_link[:, run])
-        if not moved:
+        if not self.groups:
             return self.point_link, self.normal_link
-        of = library(Ts_camera_link)
-        return of.concatenate(moved, 1), of.concatenate(turned, 1)
+        Ts, points, normals = array_if_faster(Ts_camera_link), self.point_link, self.normal_link
+        of, moved, turned = library(Ts), [], []
+        if of is np:
+            points, normals = as_array(points), as_array(normals)
+        for view, link, run in self.runs():
+            T = Ts[view, link]
+            moved.append(T[:3, :3] @ points[:, run] + T[:3, 3:])
+            turned.append(T[:3, :3] @ normals[:, run])
+        return converted(of.concatenate(moved, 1), Ts_camera_link), converted(of.concatenate(turned, 1), Ts_camera_link)
 
     def intrinsics(self, intrinsics: Float[Array, "views 4"]) -> Float[Array, "4 K"]:
         """fx, fy, cx, cy of each point's view."""

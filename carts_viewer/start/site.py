@@ -79,7 +79,7 @@ class Site:
         self.app: ViewerApp | None = None
         self.storage_failure: str | None = None
         self.shown: SitePage | None = None
-        self._listening = False
+        self._listen()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="carts-site", daemon=True)
         self._thread.start()
@@ -185,14 +185,17 @@ class Site:
         again = not self._listening
         if again:
             self.page.clear("CaRTS")
-            gui = self.page.server.gui
-            gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
-            self.page.listen(Chosen | Clicked, lambda _, event: self.post(lambda: self._dispatch(event)))
-            self._listening = True
+            self._listen()
         self.shown = make()
         self.shown.show()
         if again:
             self.page.reload()
+
+    def _listen(self) -> None:
+        """Prepare an empty page for documents."""
+        self.page.server.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
+        self.page.listen(Chosen | Clicked, lambda _, event: self.post(lambda: self._dispatch(event)))
+        self._listening = True
 
     def _dispatch(self, event: Chosen | Clicked) -> None:
         page = self.shown
