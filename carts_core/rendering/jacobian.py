@@ -250,13 +250,16 @@ def keep_outline(face_ids, inverse_depth, nearness, border, share):
     for camera in range(cameras):
         near = inverse_depth[camera]
         for row in range(border, height - border):
+            above, here, below = near[row - 1], near[row], near[row + 1]
             for column in range(border, width - border):
-                least = nearness * near[row, column]
-                if least > 0.0 and (
-                    near[row - 1, column] < least
-                    or near[row + 1, column] < least
-                    or near[row, column - 1] < least
-                    or near[row, column + 1] < least
+                if here[column] == 0.0:
+                    continue
+                least = nearness * here[column]
+                if (
+                    above[column] < least
+                    or below[column] < least
+                    or here[column - 1] < least
+                    or here[column + 1] < least
                 ):
                     mixed = np.uint32(np.uint32(row) * np.uint32(2654435761)) ^ np.uint32(
                         np.uint32(column) * np.uint32(2246822519)
