@@ -175,9 +175,10 @@ def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int]
     moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
     moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
     runs = points.runs()
+    views, links = [view for view, _, _ in runs], [link for _, link, _ in runs]
     families: list[tuple[list[int], set[int]]] = []
-    for unknown, moved in enumerate(moves.cpu().numpy()):
-        mine = {index for index, (view, link, _) in enumerate(runs) if moved[view, link]}
+    for unknown, moved in enumerate(moves.cpu().numpy()[:, views, links]):
+        mine = set(np.flatnonzero(moved).tolist())
         if not mine:
             continue
         related = [family for family in families if family[1] & mine]
