@@ -24,8 +24,8 @@ def as_array(values: Array) -> np.ndarray:
 
 
 def array_if_faster(values: Array) -> Array:
-    """The array of a tensor on the CPU without gradients, because small operations are faster in NumPy; its memory is
-    shared. Other tensors, and arrays, are unchanged."""
+    """Convert a CPU tensor that requires no gradient to an array with the same memory, since small operations are
+    faster in NumPy. Other tensors, and arrays, are returned unchanged."""
     if isinstance(values, np.ndarray) or values.requires_grad or values.device.type != "cpu":
         return values
     return values.numpy()

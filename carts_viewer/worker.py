@@ -40,7 +40,7 @@ class Worker:
         self._worked_at: float | None = 0.0
         """Time of the last work [s, monotonic]; None once its memory is returned."""
         self._returned_at = 0.0
-        """Time of the last return of memory [s, monotonic]."""
+        """Time at which freed memory was last returned to the system [s, monotonic]."""
         self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
 
     def start(self, startup: Callable[[], None] | None = None) -> None:

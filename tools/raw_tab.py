@@ -102,7 +102,7 @@ class RawTab:
         self.send(_update(element, value))
 
     def report(self, kind: str, **values: Any) -> None:
-        """Report an event, as our page does; errors as `set`."""
+        """Report an event, as our page does; errors as in `set`."""
         self.send(self._report(kind, **values))
 
     def find(self, label: str) -> str:
@@ -116,11 +116,11 @@ class RawTab:
         )
 
     def press(self, command: str) -> None:
-        """Trigger the command of a key; errors as `set`."""
+        """Trigger the command of a key; errors as in `set`."""
         self.send({"type": "CommandTriggerMessage", "uuid": command})
 
     def send(self, message: dict[str, Any] | bytes | str) -> None:
-        """Send a message, or any bytes or text; errors as `set`."""
+        """Send a message, or any bytes or text; errors as in `set`."""
         data = msgspec.msgpack.encode(message) if isinstance(message, dict) else message
         asyncio.run_coroutine_threadsafe(self._push(data), self._loop).result(_PATIENCE)
 

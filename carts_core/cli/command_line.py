@@ -85,7 +85,7 @@ def command_class(name: str, options: Sequence[str] = ()) -> Any:
     return getattr(import_module(f".{module}", __package__), kind)
 
 
-def _any_command() -> Any:
+def any_command() -> Any:
     """Union of all subcommands."""
     return reduce(or_, (Annotated[command_class(name), tyro.conf.subcommand(name)] for name in COMMANDS))
 
@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
             if "--help-all" in arguments:
                 shown = [argument if argument != "--help-all" else "--help" for argument in arguments]
                 with contextlib.suppress(SystemExit):
-                    tyro.cli(_any_command(), prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
+                    tyro.cli(any_command(), prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
                 print(settings_reference())
                 return
             arguments = [argument for argument in arguments if argument != "--print-settings"]
@@ -149,7 +149,7 @@ def _parsed(arguments: list[str]) -> Any:
             if name in COMMANDS:
                 # For a misspelt option, suggest only options of the same command.
                 return tyro.cli(command_class(name, options), prog=f"carts {name}", args=options)
-            return tyro.cli(_any_command(), prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
+            return tyro.cli(any_command(), prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
     except SystemExit:
         print(said.getvalue(), end="", file=sys.stderr)
         if found := _INVALID_CHOICE.search(" ".join(said.getvalue().replace("│", " ").split())):

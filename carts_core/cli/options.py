@@ -569,8 +569,8 @@ class ObservationOptions(Network):
         """Remark that Dice scores refer to the fitted masks; None without fitted masks."""
         if self.observe == "network":
             return None
-        against = "the fitted masks" if self.masks == RECORDING else "the fitted masks if the recording has no masks"
-        return f"Dice is computed with {against}, so it measures agreement with these masks instead of accuracy."
+        text = "Dice is computed with the fitted masks, so it measures agreement with these masks instead of accuracy."
+        return text if self.masks == RECORDING else f"If the recording has no masks, {text}"
 
 
 @dataclass(frozen=True)

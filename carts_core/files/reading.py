@@ -267,7 +267,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
 
 def _opened(path: Path | str, kind: Kind, folder: int | None = None) -> tuple[int, int]:
     """Descriptor and size [bytes] of a regular file, given by its path or by its name in an open folder, where links
-    are refused; raises as `open_regular`.
+    are refused; errors as in `open_regular`.
     """
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY | (0 if folder is None else os.O_NOFOLLOW)
     try:

@@ -118,7 +118,7 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
 
 @contextmanager
 def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
-    """Open a seekable, readable stream that becomes the file if the block succeeds; raises as `write_bytes`."""
+    """Open a seekable, readable stream that becomes the file if the block succeeds; errors as in `write_bytes`."""
     output = as_output(path)
     with explained(output), opened_folder(output.parent, make=True) as folder:
         if output.draft:

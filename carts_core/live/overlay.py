@@ -24,7 +24,7 @@ from .tracker import LiveVerdict
 KEY = (0, 255, 0)
 """Colour that the console replaces by its own image, RGB."""
 COLOURS = {LiveVerdict.GOOD: (255, 0, 255), LiveVerdict.DOUBTFUL: (255, 140, 0)}
-"""Outlines by verdict, RGB, far from the key colour; lost arms have no outline."""
+"""Outline colours by verdict, RGB, far from the key colour; lost arms have no outline."""
 _WIDTH = 3
 """Width of the outlines [px]."""
 _RATE = 30

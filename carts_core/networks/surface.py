@@ -1,7 +1,7 @@
-"""Surface network: a pretrained encoder, conditioned on the surface map of the measured kinematics, and a decoder.
+"""Surface networks: the shipped U-Net (`UNetSurface`), and a pretrained encoder with a decoder (`SurfaceNetwork`).
 
-The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet. The measured kinematics have errors of a few
-degrees but provide a prior pose, which the network corrects.
+The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet; weights with it are not shipped. The measured
+kinematics have errors of a few degrees but provide a prior pose, which the network corrects.
 """
 
 from dataclasses import dataclass

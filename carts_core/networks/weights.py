@@ -100,7 +100,7 @@ def read_weights(path: Path) -> Weights:
     if len(working_size) != 2 or any(not 0 < n <= _MAX_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
             f"weights file {path} has the working size {working_size}; allowed: two positive multiples of "
-            f"{architecture.stride}. {REMEDY}"
+            f"{architecture.stride} up to {_MAX_SIDE}. {REMEDY}"
         )
     return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
 

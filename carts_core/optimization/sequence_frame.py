@@ -355,7 +355,7 @@ class ColourTracker:
         Args:
             overdue: whether the frame is measured without the network even if the network is due.
         """
-        if self._colours is None or self._pause > 0 or (self.due and not overdue):
+        if self._colours is None or self._pause > 0 or (self.due and not overdue) or solver.masked(frame):
             return None
         (stage,) = self._model.between
         assert isinstance(stage, AlignRegions)

@@ -506,7 +506,7 @@ class SequenceAssessment:
     remedy: str
     """Remedy as one sentence; empty if none is needed."""
     probability: float
-    """Mean probability over the frames that the mask is wrong [1]."""
+    """Probability that the mask is wrong, averaged over the frames [1]."""
     counts: Mapping[str, int]
     """Verdict -> number of frames."""
 

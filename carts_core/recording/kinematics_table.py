@@ -113,7 +113,7 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
         )
     repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if repeated:
-        raise SequenceError(f"{path} has several columns {listed(map(repr, repeated))}. Rename all but one.")
+        raise SequenceError(f"{path} has duplicate columns: {listed(map(repr, repeated))}. Rename the duplicates.")
     if set(map(len, rows)) != {len(header)}:
         line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != len(header))
         raise SequenceError(
@@ -271,7 +271,7 @@ class JointColumns:
         return tuple(name for name in self.robot.joint_names if name in mapped)
 
     def read(self, table: Table) -> Float[np.ndarray, "rows dofs"]:
-        """Read the joint positions of all rows [rad], [m], in the robot's order; raises as `JointColumn.read`."""
+        """Read the joint positions of all rows [rad], [m], in the robot's order; errors as in `JointColumn.read`."""
         names = self.robot.joint_names
         positions = np.tile([self.defaults.get(name, 0.0) for name in names], (len(table), 1))
         for column in self.columns:

@@ -275,12 +275,12 @@ class Sequence:
         return self._camera(name).camera
 
     def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
-        """Source of a camera's recorded images; not cached. Errors as `has_masks`."""
+        """Source of a camera's recorded images; not cached. `SequenceError` for an unknown camera or domain."""
         return self._camera(camera).images[self._domain(domain)]
 
     def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
         """File that contains a frame's image unchanged; None if the image is undistorted, cropped, rotated, or decoded
-        from a video or a bag. Errors as `has_masks`."""
+        from a video or a bag. `SequenceError` for an unknown camera or domain."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
         changed = any(entry.camera.distortion) or index in entry.missing
@@ -289,13 +289,13 @@ class Sequence:
         return source.files[index]
 
     def image_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str:
-        """Text that changes with the recorded image of a frame; the image is not decoded. Errors as `frame`."""
+        """Text that changes with the recorded image of a frame; the image is not decoded. Errors as in `frame`."""
         if index in self._camera(camera).missing:
             return "missing"
         return self._camera(camera).images[self._domain(domain)].fingerprint(index)
 
     def mask_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str | None:
-        """SHA-256 of the mask file of a frame; None without a mask. Errors as `image_fingerprint`."""
+        """SHA-256 of the mask file of a frame; None without a mask. Errors as in `image_fingerprint`."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         path = None if masks is None else masks[index]
         return None if path is None else hashlib.sha256(read_file(path)).hexdigest()

@@ -99,7 +99,7 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
     stream = container.streams.best("video")
     if not isinstance(stream, VideoStream) or stream.codec_context is None:  # None for an unknown codec.
         container.close()
-        raise SequenceError(f"video {path} cannot be decoded (it has no video stream). {_remedy(path)}")
+        raise SequenceError(f"video {path} cannot be decoded (no video stream with a known codec). {_remedy(path)}")
     if (problem := pixels_problem(stream.width, stream.height)) is not None:
         container.close()
         raise SequenceError(f"video {path} {problem}. {_remedy(path)}")

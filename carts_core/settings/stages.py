@@ -104,7 +104,7 @@ class SilhouetteSearch(Ranged):
 
 @dataclass(frozen=True)
 class AlignEdges(Ranged):
-    """Move the outlines of the arms to image edges, weighted against the surface factor. Skipped if given masks are the
+    """Move the outlines of the arms to image edges, weighted against the other factors. Skipped if given masks are the
     target, since they define the outlines."""
 
     steps: Annotated[int, Range(1, 1000)] = 24

@@ -137,7 +137,7 @@ class SurfaceArchitecture:
 
     @staticmethod
     def from_json(text: str) -> "SurfaceArchitecture":
-        """Decode the result of `to_json`. Errors as `Architecture.from_json`."""
+        """Decode the result of `to_json`. Errors as in `Architecture.from_json`."""
         values = parse_json(text)
         return SurfaceArchitecture(**{name: tuple(int(n) for n in counts) for name, counts in values.items()})
 

@@ -74,7 +74,7 @@ class Clicking:
             self.problem = str(error)
 
     def names(self, arm: str) -> tuple[str, ...]:
-        """All landmarks of an arm."""
+        """Names of all landmarks of an arm."""
         return tuple(landmarks(self.sequence.scene.arm(arm)))
 
     def hint(self, arm: str, landmark: str) -> str:

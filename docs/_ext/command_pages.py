@@ -3,7 +3,6 @@
 import contextlib
 import io
 import os
-import typing
 
 import tyro
 
@@ -15,11 +14,7 @@ WIDTH = 88
 
 def subcommands() -> dict[str, type]:
     """Name of each subcommand -> its dataclass, in the order of `carts --help`."""
-    found = {}
-    for member in typing.get_args(cli.Command):
-        command, *annotations = typing.get_args(member)
-        found[next(note.name for note in annotations if hasattr(note, "name"))] = command
-    return found
+    return {name: cli.command_class(name) for name in cli.COMMANDS}
 
 
 def help_text(*arguments: str) -> str:
@@ -30,7 +25,7 @@ def help_text(*arguments: str) -> str:
     os.environ.pop("FORCE_COLOR", None)
     try:
         with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-            tyro.cli(cli.Command, prog="carts", args=[*arguments, "--help"])  # pyright: ignore
+            tyro.cli(cli.any_command(), prog="carts", args=[*arguments, "--help"])  # pyright: ignore
     finally:
         os.environ.clear()
         os.environ.update(before)

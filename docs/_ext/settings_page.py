@@ -2,7 +2,9 @@
 
 import dataclasses
 import inspect
+import pkgutil
 import typing
+from importlib import import_module
 from pathlib import Path
 
 from sphinx.pycode import ModuleAnalyzer
@@ -18,9 +20,10 @@ def settings_page() -> str:
         "ranges; options of the [commands](../cli.md) are made from the same fields. A value outside its range is "
         "refused with a message that states the range.",
     ]
-    for name, cls in vars(carts_core.settings).items():
-        if inspect.isclass(cls) and dataclasses.is_dataclass(cls):
-            parts.append(_section(name, cls))
+    for module in pkgutil.iter_modules(carts_core.settings.__path__, f"{carts_core.settings.__name__}."):
+        for name, cls in vars(import_module(module.name)).items():
+            if inspect.isclass(cls) and dataclasses.is_dataclass(cls) and cls.__module__ == module.name:
+                parts.append(_section(name, cls))
     return "\n\n".join(parts) + "\n"
 
 

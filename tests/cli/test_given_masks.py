@@ -105,7 +105,7 @@ def test_masks_of_a_folder_are_fitted_and_are_the_truth_where_the_recording_has_
     found = scores(sequence, "--observe", "masks", "--masks", str(theirs), "--mode", "sequence")
     assert found["observed"] == "masks" and found["masks"] == str(theirs)
     assert found["mean"]["dice_before"] < 0.95 and found["mean"]["dice_after"] > 0.97
-    assert f"{CAUTION} if the recording has no masks" in said()
+    assert f"If the recording has no masks, {CAUTION}" in said()
 
 
 @pytest.mark.usefixtures("no_network")

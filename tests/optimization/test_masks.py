@@ -15,9 +15,17 @@ from carts_core.evaluation import dice
 from carts_core.imaging.working_image import Window
 from carts_core.model.parts import COVERAGE
 from carts_core.model.perturbation import perturb
-from carts_core.optimization import CalibrationOptimizer, FrameOptimizer, MaskPredictor, SequenceOptimizer
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import (
+    CalibrationOptimizer,
+    FrameOptimizer,
+    MaskPredictor,
+    NetworkPredictor,
+    SequenceOptimizer,
+)
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
+from carts_core.resources import sample_sequence
 from carts_core.settings import FreeParameters
 
 SIZE = {"width": 320, "height": 240}
@@ -104,6 +112,21 @@ def test_every_frame_of_a_sequence_is_fitted_to_its_own_mask(sequence: Sequence)
     for index, estimate in optimizer.estimates.items():
         mask = (sequence.frame(index).masks or {})["left"]
         assert dice(renderer.segment(estimate.state)[0] >= 0, mask) > 0.98
+
+
+def test_colours_do_not_replace_given_masks() -> None:
+    shipped = Sequence.open(sample_sequence())
+    masked = (3, 4)
+    network = NetworkPredictor(FeatureExtractor.load())
+
+    def masks(index: int) -> dict[str, np.ndarray]:
+        return dict(shipped.frame(index).masks or {}) if index in masked else {}
+
+    predictor = MaskPredictor(network, masks)
+    optimizer = SequenceOptimizer(shipped.scene, shipped.frame, dict.fromkeys(range(6)), predictor)
+    list(optimizer)
+    by_colours = [index for index, visit in optimizer._visits.items() if visit.measurement.by_colours]
+    assert by_colours and not set(by_colours) & set(masked)
 
 
 def test_the_order_in_which_cameras_are_named_changes_no_estimate(tiny_sequence: Callable[..., Path]) -> None:

@@ -178,7 +178,7 @@ def test_a_missing_sequence_file_and_a_folder_are_named(tmp_path):
         ("", ["has no rows", "a header and one row per frame"]),
         ("frame,yaw\n", ["has no rows"]),
         ("frame;yaw\n1;2\n", ["not separated by ','", "delimiter = ';'"]),
-        ("frame,yaw,yaw\n1,2,3\n", ["several columns 'yaw'"]),
+        ("frame,yaw,yaw\n1,2,3\n", ["duplicate columns: 'yaw'"]),
         ("frame,yaw\n1,2\n2\n", ["line 3 has 1 cells, but the header has 2"]),
         ("row,yaw\n1,2\n", ["has no column 'frame'", "`frame` in [kinematics]", "row, yaw"]),
         ("frame,yaw\na,2\n", ["'{frame:03d}' cannot be filled in", "'a'"]),

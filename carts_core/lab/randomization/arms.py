@@ -29,7 +29,7 @@ PERFECT_MODEL = 0.5
 _CHAIN_LENGTH = (0.25, 1.3)
 """Range of the sum of all link lengths [m]."""
 _CHAIN_RADIUS = (0.10, 0.45)
-"""Range of a link's radius, relative to its length [1]."""
+"""Range of the first link's radius, relative to the mean link length [1]."""
 _CHAIN_LIMIT = 2.6
 """Joint limits of revolute joints [rad]."""
 

@@ -63,7 +63,7 @@ _REMOTE_CENTRES_CAMERA = ((-0.092, 0.062, 0.006), (0.098, -0.010, 0.002))
 """Points at which the instruments pass through the body wall, in the frame of the left camera [m]."""
 
 WORK_POINTS = ((-0.011, -0.001, 0.014), (0.012, 0.002, 0.014))
-"""World points at which the instruments point with centred joints [m]."""
+"""World points at which the shafts point at zero joint positions, and about which the tips move [m]."""
 
 
 def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:

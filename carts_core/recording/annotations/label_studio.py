@@ -102,7 +102,7 @@ def _image_name(data: dict[str, Any], control: str) -> str:
         chosen = next(iter(images))
     elif control not in images and len(images) > 1:
         raise ValueError(
-            f"its task has the images {listed(images, 4)}, and none has the name of its control; rename one of them"
+            f"its task has image fields {listed(images, 4)}, but none has the name of its Image tag; rename one"
         )
     if chosen is None:
         raise ValueError(f"its task has no image file in the fields {listed(data, 4)}")

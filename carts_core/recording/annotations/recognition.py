@@ -131,7 +131,7 @@ def _read_folder(place: Path, format: AnnotationFormat | None, remarks: Counter[
 def _labels(folder: Path, confined: bool) -> list[Path]:
     files = label_files(folder, confined=confined)
     if not files:
-        raise SequenceError(f"{folder} has no YOLO labels (.txt, in folders called labels). Give the folder with both.")
+        raise SequenceError(f"{folder} has no YOLO labels (.txt). Give the folder that contains them.")
     return files
 
 

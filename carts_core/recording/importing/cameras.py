@@ -259,7 +259,7 @@ def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
     if len(kinds) != 1:
         shown = ", ".join(sorted(file.name for file in files)[:3])
         raise SequenceError(
-            f"the names of the images in {folder} differ in more than one number: {shown} ... Rename them (such as "
+            f"the names of the images in {folder} must differ in one number only: {shown} ... Rename them (such as "
             "frame0001.png, frame0002.png), or put the images of each camera into a separate folder."
         )
     ((before, after), numbers) = next(iter(kinds.items()))
