@@ -168,7 +168,7 @@ class Rows:
     """Column with the times of the rows; empty without times."""
 
     def measured_of(self, arm: TomlTable, columns: JointColumns) -> Samples:
-        """Measured joint positions of an arm, from its own `table` or the table of the sequence; errors as in `read`."""
+        """Measured joint positions of an arm, from its `table` or the table of the sequence; errors as in `read`."""
         own = arm.take("table", str, "")
         table = self.read(arm.path(own)) if own else self.table
         return replace(self.samples(table, columns.read(table)), time_offset=self.offset_of(arm))
@@ -183,7 +183,7 @@ class Rows:
         return offset
 
     def truth_of(self, arm: TomlTable, columns: JointColumns) -> Samples | None:
-        """True joint positions of an arm, from its own `truth` or the table of the sequence; errors as in `read`."""
+        """True joint positions of an arm, from its `truth` or the table of the sequence; errors as in `read`."""
         own = arm.take("truth", str, "")
         if (path := arm.path(own) if own else self.truth) is None:
             return None

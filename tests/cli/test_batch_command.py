@@ -23,7 +23,7 @@ from carts_core.cli import main
 from carts_core.cli.batch_job import BatchWork
 from carts_core.files import output_path
 from carts_core.networks import FeatureExtractor
-from carts_core.settings.optimization import Inference
+from carts_core.settings.optimization import Engine
 
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 
@@ -161,7 +161,7 @@ def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: 
 
 @pytest.mark.parametrize("engine", ["torch", "onnx"])
 def test_every_step_that_runs_the_network_knows_with_what(
-    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Inference
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Engine
 ) -> None:
     class Loaded(BaseException):
         """The weights were asked for, and nothing more is of interest."""
