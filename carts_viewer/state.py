@@ -389,6 +389,8 @@ class LiveState:
     """Latency of the shown result [s]."""
     current: bool = True
     """Whether the latency is at most two frame intervals of the stream."""
+    silent: float = 0.0
+    """Time without a new result [s]; 0 while results arrive."""
 
 
 @dataclass(frozen=True)

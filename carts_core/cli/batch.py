@@ -1,6 +1,8 @@
 """`carts batch`: pipelines over many recordings, on one or several machines."""
 
 import math
+import os
+import shlex
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 _BETWEEN_SUMMARIES = 1.0
 """Minimum interval between updates of throughput and cost [s]."""
+_FEW = 100
+"""Number of finished jobs up to which throughput and cost are updated after each job."""
 _NAMED = 5
 """Maximum number of failed jobs named in the final message."""
 
@@ -76,7 +80,7 @@ class Batch(RangedOptions):
                 console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
         if len(chosen) < len(jobs):
             console.print("this shard is done; after the last shard, write the report with --report-only")
-        console.print(f"to inspect the results: carts view {folder}")
+        console.print(f"to inspect the results: carts view {folder}{_roots(jobs, folder.path)}")
         if failed:
             lines = {name: (error.strip() or "unknown cause").splitlines()[-1] for name, error in failed.items()}
             named = "".join(f"\n  {name}: {line}" for name, line in list(lines.items())[:_NAMED])
@@ -87,8 +91,6 @@ class Batch(RangedOptions):
 
     def _run(self, console: Terminal, jobs: "list[Job]", folder: "OutputPath") -> dict[str, str]:
         """Run jobs; returns job name -> error of the failed jobs."""
-        import os
-
         from ..batch.cost import Cost, JobCost
         from ..batch.engines import Pool
         from ..package_imports import require_package
@@ -107,7 +109,7 @@ class Batch(RangedOptions):
             counts_of = f"{those} of {counted(len(jobs), 'job')} use the project beside the recording"
             console.print(f"{counts_of} (see the logs). To use the measured joints: --project none")
         failed, counts, done = {}, Counter(), []
-        began, shown = time.monotonic(), -math.inf
+        began, shown, summary = time.monotonic(), -math.inf, ""
         columns = Bar.get_default_columns()[:-1]  # The last one estimates the remaining time from jobs done earlier.
         with Bar(*columns, console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
@@ -117,13 +119,12 @@ class Batch(RangedOptions):
                     failed[outcome.job] = outcome.error
                 if outcome.status == "done":
                     done.append(JobCost(outcome.seconds, outcome.processor, outcome.frames))
-                bar.update(task, advance=1)
                 left = len(jobs) - counts.total()
-                if time.monotonic() - shown > _BETWEEN_SUMMARIES or not left:
+                if time.monotonic() - shown > _BETWEEN_SUMMARIES or len(done) <= _FEW or not left:
                     shown, running = time.monotonic(), min(engine.workers, left)
                     summary = Cost(tuple(done), left, running).summary(running or engine.workers)
-                    parts = ["jobs", f"{counts['failed']} failed", summary]
-                    bar.update(task, description=", ".join(filter(None, parts)))
+                parts = ["jobs", f"{counts['failed']} failed", summary]
+                bar.update(task, advance=1, description=", ".join(filter(None, parts)))
         words = {"done": "done", "known": "done earlier", "busy": "run by another process", "failed": "failed"}
         console.print(", ".join(f"{counts[status]} {words[status]}" for status in words if counts[status]))
         if done:
@@ -135,3 +136,11 @@ class Batch(RangedOptions):
             )
             console.print(f"estimates for these jobs: {cost.forecast()}")
         return failed
+
+
+def _roots(jobs: "list[Job]", folder: Path) -> str:
+    """Option that allows the page to open recordings outside of the current folder and of the batch's folder."""
+    allowed = (f"{Path.cwd()}{os.sep}", f"{folder.absolute()}{os.sep}")
+    parents = {os.path.dirname(job.recording) for job in jobs}
+    outside = [parent for parent in parents if not f"{parent}{os.sep}".startswith(allowed)]
+    return f" --root {shlex.quote(os.path.commonpath(outside))}" if outside else ""

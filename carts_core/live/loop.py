@@ -1,5 +1,6 @@
 """Live tracking loop: tracks the latest frame of a source and passes the result to sinks."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -9,6 +10,7 @@ import numpy as np
 
 from ..model.scene import Scene
 from ..rendering import Renderer
+from ..settings.live import CURRENT
 from .messages import LatestFrame, ResultMessage, Source, StreamFrame, encoded_masks
 from .tracker import LiveEstimate, LiveTracker, LiveVerdict
 
@@ -19,9 +21,6 @@ _USUAL = 75
 _FRESH = 0.01
 """Lower bound of the `patience` with which a frame is taken [s]."""
 
-_CURRENT = 2.0
-"""Maximum age of a current result [frame intervals]."""
-
 
 @dataclass(frozen=True)
 class Tracked:
@@ -31,8 +30,13 @@ class Tracked:
     estimate: LiveEstimate
     age: float
     """Time since the arrival of the frame [s]."""
-    current: bool = True
-    """Whether the age is at most two frame intervals of the stream."""
+    interval: float = math.inf
+    """Mean time between recent frames of the stream [s]."""
+
+    @property
+    def current(self) -> bool:
+        """Whether the age is at most two frame intervals of the stream."""
+        return self.age <= CURRENT * self.interval
 
 
 Sink = Callable[[Tracked], None]
@@ -104,7 +108,7 @@ def follow(
             estimate = tracker.track(stream_frame.frame, stream_frame.camera_poses)
             taken.append(estimate.seconds)
             age = time.monotonic() - stream_frame.arrived
-            tracked = Tracked(stream_frame, estimate, age, age <= _CURRENT * latest.interval)
+            tracked = Tracked(stream_frame, estimate, age, latest.interval)
             statistics.add(tracked)
             statistics.arrived, statistics.dropped = latest.arrived, latest.dropped
             for sink in sinks:

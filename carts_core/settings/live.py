@@ -24,6 +24,8 @@ class StreamKind(StrEnum):
 
 KNOWN = "replay, camera:NUMBER, video:FILE, folder:PATH or socket:PORT"
 _PORTS = 2**16
+CURRENT = 2.0
+"""Maximum age of a current result [frame intervals]."""
 
 Seconds = Annotated[float, Range(0, 3600, "s")]
 """Duration [s]."""

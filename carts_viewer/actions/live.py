@@ -7,7 +7,7 @@ from typing import Protocol
 
 from carts_core.errors import CartsError
 from carts_core.project import Source
-from carts_core.settings.live import StreamAddress, StreamKind
+from carts_core.settings.live import CURRENT, StreamAddress, StreamKind
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.live_stream import LiveEnded, LiveResult, LiveStep, LiveTask
@@ -17,6 +17,9 @@ from carts_viewer.state import LiveState, Pose
 
 _STATISTICS_INTERVAL = 0.5
 """Interval between updates of the statistics [s]."""
+_PATIENCE, _LONGEST_PATIENCE = 0.5, 2.0
+"""Minimum and maximum time without a result after which the shown result is outdated [s]; in between, `CURRENT` frame
+intervals."""
 _ENDLESS_LOOPS = 1_000_000
 ALLOWED_WHILE_LIVE = (
     intents.StartLive,
@@ -55,6 +58,10 @@ class LiveHandler(Handler):
         self._live: Run[LiveStep | LiveEnded] | None = None
         self._reply: Reply[LiveStep | LiveEnded | None] | None = None
         self._tell_at = 0.0
+        self._stopping = False
+        """Whether the stream was asked to end."""
+        self._arrived, self._patience = 0.0, _LONGEST_PATIENCE
+        """Time of the newest result [s, monotonic], and time without a result after which it is outdated [s]."""
 
     @property
     def active(self) -> bool:
@@ -62,7 +69,11 @@ class LiveHandler(Handler):
         return self._live is not None
 
     def _on_StopLive(self, intent: intents.StopLive) -> None:
-        self.stop("Stopped.")
+        shown = self._context.state.live
+        if self.active and shown is not None:
+            # The solver may take a while to answer.
+            self._stopping = True
+            self._context.change(live=replace(shown, text="Stopping."))
 
     def replaces(self, intent: intents.Intent) -> bool:
         """Carry out an intent that has another meaning during a stream; returns whether it was carried out.
@@ -90,7 +101,10 @@ class LiveHandler(Handler):
         Raises:
             CartsError: the error that ended the stream.
         """
-        if self._live is None or self._reply is None or not self._reply.done:
+        if self._live is None or self._reply is None:
+            return
+        self._notice_silence()
+        if not self._reply.done:
             return
         try:
             found = self._reply.result()
@@ -98,7 +112,10 @@ class LiveHandler(Handler):
             self._show_recording("The stream ended with an error.")
             raise
         if not isinstance(found, LiveStep):
-            self._end(found, "The stream has ended.")
+            self._end(found, "Stopped." if self._stopping else "The stream has ended.")
+            return
+        if self._stopping:
+            self._reply = self._live.next(True)
             return
         self._reply = self._live.next()
         shown = self._context.state.live
@@ -109,6 +126,14 @@ class LiveHandler(Handler):
                 self._context.change(live=replace(shown, text=waits))
         if found.newest is not None:
             self._show_result(found.newest, found.text)
+
+    def _notice_silence(self) -> None:
+        """Mark the shown result as outdated if no newer result arrives."""
+        shown, silent = self._context.state.live, time.monotonic() - self._arrived
+        if shown is None or shown.busy or silent < self._patience:
+            return
+        if silent - shown.silent >= _STATISTICS_INTERVAL or shown.silent == 0.0:
+            self._context.change(live=replace(shown, silent=silent))
 
     def stop(self, why: str) -> None:
         """Stop the stream, show the recording again, and close the recorder.
@@ -168,7 +193,7 @@ class LiveHandler(Handler):
         measured = session.measured(state.frame)
         task = LiveTask(session.sequence, address, cameras, state.domain, measured, free, intent.rate, loops, folder)
         self._live = self._optimizers.live(task)
-        self._reply, self._tell_at = self._live.next(), 0.0
+        self._reply, self._tell_at, self._stopping = self._live.next(), 0.0, False
         starts = LiveState(source=str(address), text="Starting.", busy=True)
         context.change(live=starts, scores=None, maps=None, busy=None)
 
@@ -192,7 +217,9 @@ class LiveHandler(Handler):
         if time.monotonic() >= self._tell_at:
             self._tell_at = time.monotonic() + _STATISTICS_INTERVAL
             text = statistics
-        now = {"verdict": found.verdict, "age": found.age, "current": found.current}
+        self._arrived = time.monotonic()
+        self._patience = min(max(CURRENT * found.interval, _PATIENCE), _LONGEST_PATIENCE)
+        now = {"verdict": found.verdict, "age": found.age, "current": found.current, "silent": 0.0}
         context.change(
             frame=frame,
             camera=camera,

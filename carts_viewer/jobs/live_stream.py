@@ -53,6 +53,8 @@ class LiveResult:
     verdict: str
     age: float
     """Latency [s]."""
+    interval: float
+    """Mean time between recent frames [s]; infinite if unknown."""
     current: bool
     """Whether the latency is at most two frame intervals."""
 
@@ -175,4 +177,5 @@ class _Follower(threading.Thread):
 def _result(scene: Scene, tracked: "Tracked") -> LiveResult:
     estimate, frame = tracked.estimate, tracked.stream_frame.frame
     frame = replace(frame, mounts=mounts_of(scene, frame, tracked.stream_frame.camera_poses))
-    return LiveResult(frame, estimate.joint_positions, estimate.verdict.value, tracked.age, tracked.current)
+    verdict, times = estimate.verdict.value, (tracked.age, tracked.interval)
+    return LiveResult(frame, estimate.joint_positions, verdict, *times, tracked.current)

@@ -99,8 +99,13 @@ class BrowsePanel:
 
     def _describe(self, state: ViewState) -> str:
         """Name of a live frame, source of the joint positions, time and scores, as HTML."""
-        live = [f"Live frame <b>{escaped(state.frame.frame_id)}</b>"] if state.streaming else []
-        parts = [*live, self._source(state)]
+        if state.live is not None and state.live.on:
+            if state.live.busy:
+                self._scores = Scores()
+                return "The recording, until the first live frame arrives"
+            parts = [f"Live frame <b>{escaped(state.frame.frame_id)}</b>"]
+        else:
+            parts = [self._source(state)]
         if state.frame.timestamp is not None:
             parts.append(_time(state.frame.timestamp, self._began))
         scores = self._scores = state.scores or self._scores

@@ -75,16 +75,26 @@ class LivePanel:
 def live_text(live: LiveState) -> str:
     """The tracker's verdict on the shown frame, as HTML."""
     if live.busy:
-        return f'<div class="carts-verdict unknown" role="status"><b>Live</b> {escaped(live.text)}</div>'
-    reason = {
-        "good": "The arms are tracked.",
-        "doubtful": "The fit does not match the image; the prediction from earlier frames is shown.",
-        "lost": "The arms were not found; the measured joints with the last correction are shown.",
+        return _live_box("unknown", "Live", live.text)
+    if live.silent:
+        return _live_box("doubtful", f"Live: no new frame for {live.silent:.0f} s", "The last result is shown.")
+    reason, meaning = {
+        "good": ("The arms are tracked.", ""),
+        "doubtful": ("Predicted from earlier frames.", "The fit does not match the image."),
+        "lost": ("The arms were not found.", "The measured joints with the last correction are shown."),
     }[live.verdict]
     style = {"good": "good", "doubtful": "doubtful", "lost": "failed"}[live.verdict]
     age = f"latency {1000.0 * live.age:.0f} ms{'' if live.current else ', outdated'}"
     style = style if live.current or style != "good" else "doubtful"
-    return f'<div class="carts-verdict {style}" role="status"><b>Live: {live.verdict}</b> {reason} <i>{age}</i></div>'
+    return _live_box(style, f"Live: {live.verdict}, {age}", reason, meaning)
+
+
+def _live_box(style: str, title: str, text: str, meaning: str = "") -> str:
+    hint = f' title="{escaped(f"{text} {meaning}".strip())}"'
+    return (
+        f'<div class="carts-verdict {style}" role="status"{hint}><b>{escaped(title)}</b>'
+        f"<small>{escaped(text)}</small></div>"
+    )
 
 
 _MEANING = (

@@ -26,8 +26,8 @@ from carts_core.recording import Sequence
 from carts_viewer.start.host import Host
 from carts_viewer.transport.document import render
 
-_UPDATE_INTERVAL = 5.0
-"""Interval between updates while jobs run [s]."""
+_UPDATE_INTERVAL, _IDLE_INTERVAL = 5.0, 15.0
+"""Interval between updates while jobs run, and while none runs [s]."""
 _MAX_WORST = 12
 """Maximum number of shown frames."""
 _ROWS = 100
@@ -59,12 +59,12 @@ class BatchPage:
         self._closed = threading.Event()
 
     def show(self) -> None:
-        """Update the document, and repeat the update while jobs run."""
+        """Update the document, and repeat the update."""
         self._known = known_jobs(self._batch, self._jobs, self._known)
         with gc_paused():
             self._render()
-        if any(entry.status == "running" for entry in self._known):
-            self._update()
+        running = any(entry.status == "running" for entry in self._known)
+        self._update(_UPDATE_INTERVAL if running else _IDLE_INTERVAL)
 
     def _render(self) -> None:
         """Show the known jobs; the document is sent only if it has changed."""
@@ -159,8 +159,8 @@ class BatchPage:
             return ""
         return "" if image is None else self._site.page.media.publish(cv2.imencode(".jpg", image)[1].tobytes())
 
-    def _update(self) -> None:
-        """Update the page after a while, once for any number of calls until then."""
+    def _update(self, interval: float) -> None:
+        """Update the page after an interval [s], once for any number of calls until then."""
 
         def update() -> None:
             self._waits = False
@@ -168,7 +168,7 @@ class BatchPage:
                 self.show()
 
         def wait() -> None:
-            if not self._closed.wait(_UPDATE_INTERVAL):
+            if not self._closed.wait(interval):
                 self._site.post(update)
 
         if not self._waits:

@@ -80,6 +80,8 @@ class Site:
         self.storage_failure: str | None = None
         self.shown: SitePage | None = None
         self._listen()
+        # A loaded page shows the present state of the jobs.
+        self.page.server.on_client_connect(lambda _: self.post(self._refresh))
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="carts-site", daemon=True)
         self._thread.start()
@@ -190,6 +192,10 @@ class Site:
         self.shown.show()
         if again:
             self.page.reload()
+
+    def _refresh(self) -> None:
+        if isinstance(self.shown, BatchPage):
+            self.shown.show()
 
     def _listen(self) -> None:
         """Prepare an empty page for documents."""

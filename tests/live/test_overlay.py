@@ -54,7 +54,8 @@ def test_another_program_reads_outlines_on_green(
     for pipe in pipes.values():
         os.mkfifo(pipe)
     ends = {name: os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") for name, pipe in pipes.items()}
-    overlay, result = KeyedOverlay(sequence, pipes), replace(tracked(sequence, 1, verdict), current=current)
+    age = 0.0 if current else 1.0
+    overlay, result = KeyedOverlay(sequence, pipes), replace(tracked(sequence, 1, verdict), age=age, interval=0.1)
     threads = [threading.Thread(target=read, args=(ends[name], pictures[name])) for name in pipes]
     for thread in threads:
         thread.start()

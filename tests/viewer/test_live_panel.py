@@ -17,6 +17,7 @@ from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
+from carts_viewer.panels.fit import live_text
 
 SECONDS = 120.0
 """For the networks to be there, on a busy machine."""
@@ -84,6 +85,11 @@ def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
         assert live is not None and app.state.frame.frame_id.startswith("sent") and app.state.verdict is None
         connection.settimeout(SECONDS)
         assert connection.recv(1)  # the result of a frame, for who sent it
+        silent = eventually(lambda: app.state.live, lambda live: live is not None and live.silent > 1.0, SECONDS)
+        assert silent is not None and "no new frame" in live_text(silent) and "good" not in live_text(silent)
+        connection.sendall(packed(FrameMessage(3.0, joints=joints, images=images, id="sent again")))
+        eventually(lambda: app.state.frame.frame_id, lambda name: name == "sent again", SECONDS)
+        assert app.state.live is not None and not app.state.live.silent
     app.queue.put(intents.StopLive())
     eventually(lambda: app.state.streaming, lambda on: not on)
     assert app.state.frame.frame_id == sequence.frame_ids[0]

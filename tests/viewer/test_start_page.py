@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, expect
 from viewer_tab import READY, new_context
 from waiting import eventually, wait_in
 
-from carts_core.batch.folder import is_batch, known_jobs, read_jobs, write_jobs
+from carts_core.batch.folder import JOB_FILE, is_batch, known_jobs, read_jobs, write_jobs
 from carts_core.batch.manifest import read_manifest
 from carts_core.batch.results import review_project
 from carts_core.cli.batch_job import BatchWork
@@ -275,6 +275,10 @@ def test_failures_of_a_batch_come_first_and_a_frame_opens_with_what_was_found(ba
             expect(page.locator("main")).to_have_css("background-color", colour)
             assert hardly_legible(page, 4.5) == []
             page.get_by_role("button", name="Light or dark").click()
+        state = batch / "jobs" / read_jobs(batch)[1].name / JOB_FILE
+        state.write_text(state.read_text().replace("foggy", "misty"))
+        page.reload()
+        expect(rows.first).to_contain_text("domain 'misty' is not in")
         page.locator(".card", has_text="frame 002").get_by_role("button", name="Open").click()
         app = eventually(lambda: site.app)
         assert app is not None
