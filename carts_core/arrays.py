@@ -1,4 +1,4 @@
-"""Functions for both NumPy arrays and PyTorch tensors, and of poses. PyTorch is imported only if tensors are used."""
+"""Functions for NumPy arrays, PyTorch tensors and poses. PyTorch is imported only if tensors are used."""
 
 from typing import Any
 

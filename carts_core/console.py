@@ -38,7 +38,7 @@ _MARKDOWN = re.compile(r"([\\`*{}\[\]#|!]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")
 
 
 def visible(text: str) -> str:
-    r"""Escape control characters in a string, such as `\x1b`."""
+    r"""Escape control characters other than newline and tab, for example ESC as `\x1b`."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -103,7 +103,7 @@ class Bar(Progress):
 
     @classmethod
     def get_default_columns(cls) -> tuple[ProgressColumn, ...]:
-        """Default columns: spinner, description, bar, percentage and time."""
+        """Default columns: spinner, description, bar, percentage and remaining time."""
         time_left = TimeRemainingColumn()
         return SpinnerColumn(), PlainColumn("{task.description}"), BarColumn(), TaskProgressColumn(), time_left
 

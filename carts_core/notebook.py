@@ -14,7 +14,7 @@ _QUALITY = 88
 """JPEG quality."""
 
 MEASURED_COLOUR, CORRECTED_COLOUR = (255, 170, 40), (80, 255, 120)
-"""Outlines of the measured and of the corrected arms, RGB."""
+"""Outline colours of the measured and of the corrected arms, RGB."""
 
 Colour = tuple[int, int, int]
 
@@ -36,7 +36,7 @@ class Picture:
         return picture
 
     def reduced(self) -> "Picture":
-        """Copy of at most `MAX_WIDTH`, so that outlines stay one pixel wide."""
+        """Copy with a width of at most `MAX_WIDTH`. Outlines are drawn afterwards, so they stay one pixel wide."""
         height, width = self.image.shape[:2]
         if width <= MAX_WIDTH:
             return self

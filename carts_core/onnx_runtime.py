@@ -33,7 +33,7 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         # Spinning threads would compete for the cores with other work, such as torch's.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # The memory pool would keep a block for every image size and never free it.
+    # The memory pool keeps a block for every image size and never frees it. It is not needed if malloc keeps memory.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
     options.log_severity_level = 3
     left_out = [] if fold else ["ConstantFolding"]

@@ -52,7 +52,7 @@ def leave_a_core_free() -> None:
     """Limit torch to one thread less than the number of cores, four at most, unless `OMP_NUM_THREADS` is set.
 
     Each parallel step waits for its slowest thread: with another process on one core, an iteration took 2.6 s instead
-        of 0.1 s.
+    of 0.1 s.
     """
     if "OMP_NUM_THREADS" not in os.environ and not _TUNED.core_left_free:
         import torch  # noqa: PLC0415  child processes without torch import this module, too

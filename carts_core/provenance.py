@@ -48,7 +48,7 @@ def fingerprint(*parts: bytes | str | float | np.ndarray | Iterable) -> str:
 
 @cache
 def code_fingerprint(patterns: tuple[str, ...]) -> str:
-    """SHA-256 of the source code of modules, given by patterns such as `rendering/**/*.py`."""
+    """SHA-256 of the source code of modules, given by patterns such as `rendering/**/*.py`, except `_NOT_CODE`."""
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for pattern in patterns:

@@ -167,7 +167,7 @@ def _is_ours(frame: FrameType | None) -> bool:
 
 @contextmanager
 def finished_first() -> Iterator[None]:
-    """Defer `Stopped` to the end of the block, which should be as short as a write."""
+    """Defer `Stopped` to the end of the block, which should be short, such as a single write."""
     _Unfinished.blocks += 1
     try:
         yield

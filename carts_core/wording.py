@@ -40,7 +40,8 @@ def shown(value: object, length: int = 200) -> str:
 
 
 def closest(name: str, known: Iterable[str]) -> str:
-    """Suggestion ` Did you mean 'X'?` if one of `known` resembles `name`, else empty. Numbers are not corrected."""
+    """Suggestion ` Did you mean 'X'?` if one of `known` resembles `name`, else empty. In numbers, only
+    leading zeros are corrected."""
     known, number = list(known), name.lstrip("0")
     same = [one for one in known if one.casefold() == name.casefold()]
     same = same or [one for one in known if name.isdecimal() and one.lstrip("0") == number]

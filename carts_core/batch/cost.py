@@ -35,7 +35,7 @@ class Cost:
     """
 
     done: tuple[JobCost, ...]
-    """Finished jobs whose duration is known, in the order of the manifest."""
+    """Finished jobs whose duration is known, in the order of the manifest or of their completion."""
     waiting: int
     """Number of jobs that have neither finished nor failed, including those that run."""
     running: int = 0
@@ -93,8 +93,8 @@ class Cost:
         return mean * (rounds - 0.5 if self.running and rounds else rounds)
 
     def total_time(self, workers: int) -> float | None:
-        """Estimated time of all jobs with several workers [s], each of which takes the next job of the manifest; None
-        if it is unknown."""
+        """Estimated time of all jobs with several workers [s], each of which takes the next job in the order of `done`;
+        None if it is unknown."""
         mean = self.mean_seconds
         if mean is None:
             return None

@@ -59,7 +59,7 @@ class _Worker:
 
 
 class Pool:
-    """Pool of worker processes with `threads` threads each; `work` must be importable by name.
+    """Pool of worker processes with `threads` threads each; `work` must be picklable.
 
     Attributes:
         workers: number of parallel jobs.
@@ -165,7 +165,7 @@ class Cluster:
     """Cluster of dask.distributed workers, which share a file system with this machine.
 
     Args:
-        work: function that runs a job; importable by name.
+        work: function that runs a job; must be picklable.
         scheduler: address such as `tcp://10.0.0.1:8786`, or `local` for workers on this machine.
         workers: number of local workers.
         threads: number of threads per worker.

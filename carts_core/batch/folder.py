@@ -65,7 +65,8 @@ class JobState:
     steps: Mapping[str, StepState] = field(default_factory=dict)
     """Finished steps; `findings` is the summary of their results."""
     attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Number of starts since the job last finished or failed; more than 1 if a worker was lost."""
+    """Number of starts since the job last finished or failed; more than 1 if a worker was lost or the job was
+    stopped."""
     error: str = ""
     """Reason for a failure."""
     worker: str = ""
@@ -179,7 +180,8 @@ class Findings:
     deviations: dict[str, list[float]] = field(default_factory=dict)
     """`ARM.JOINT` -> reported standard deviations [deg, mm] of the frames with known standard deviations."""
     base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
-    """`ARM in CAMERA` -> T_camera_base [4 x 4, m], calibrated if the job has a calibration step."""
+    """`ARM in CAMERA`, or `ARM in the first frame of CAMERA` for a moving camera -> T_camera_base [4 x 4, m],
+    calibrated if the job has a calibration step."""
     format: Literal["carts-findings/1"] = "carts-findings/1"
 
 
@@ -286,7 +288,7 @@ def known_jobs(
     """States and results of jobs, in the given order.
 
     Args:
-        before: earlier result; its jobs are kept if their files have not changed.
+        before: earlier result; its jobs that have ended are kept if their files have not changed.
         joints: to which corrections and deviations are added, except those of kept jobs.
     """
     earlier = {entry.job.name: entry for entry in before if entry.status in _ENDED}

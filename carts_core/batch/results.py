@@ -119,7 +119,7 @@ def review_project(folder: OutputPath, job: Job) -> Path:
 
 
 def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:
-    """Edits with the corrected joints and the verdict of each frame of a table."""
+    """Edits with the corrected joints and the verdict of each corrected frame of a table."""
     order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     try:
         records = read_records(table.parent / "results.json")

@@ -52,12 +52,12 @@ class Batch(RangedOptions):
     project: Literal["beside", "none"] = "beside"
     """Corrections for jobs that only evaluate or export: `beside` for the project beside the recording, or `none`."""
     again: bool = False
-    """Run finished steps again; results whose inputs have changed are recomputed."""
+    """Run finished steps again; `optimize` and `sequence` recompute only results whose inputs have changed."""
     report_only: bool = False
-    """Only write the report on finished jobs."""
+    """Only write the report, without running jobs."""
 
     def run(self) -> None:
-        """Run the jobs of the shard, and write the report on all jobs; `CartsError` if a job failed."""
+        """Run the jobs of the shard, and write the report if these are all jobs; `CartsError` if a job failed."""
         from ..batch.folder import write_jobs
         from ..batch.manifest import read_manifest, shard
         from ..batch.report import write_batch_report
@@ -110,7 +110,7 @@ class Batch(RangedOptions):
             console.print(f"{counts_of} (see the logs). To use the measured joints: --project none")
         failed, counts, done = {}, Counter(), []
         began, shown, summary = time.monotonic(), -math.inf, ""
-        columns = Bar.get_default_columns()[:-1]  # The last one estimates the remaining time from jobs done earlier.
+        columns = Bar.get_default_columns()[:-1]  # The last one would include jobs done earlier in its estimate.
         with Bar(*columns, console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
             for outcome in engine.run(jobs):

@@ -93,7 +93,8 @@ def with_project(job: Job) -> Path | None:
 
 
 def check_options(jobs: Sequence[Job]) -> None:
-    """Check the options of all steps before the first job; `SettingsError` for options that a command does not have."""
+    """Check the options of all steps before the first job; `SettingsError` for options that a command does not have or
+    that the job sets itself."""
     called: set[tuple[Step, tuple[str, ...]]] = set()
     for job in jobs:
         called |= {(step, job.options.get(step, ())) for step in job.steps}
@@ -122,7 +123,7 @@ def _failed(job: Job, state: RunningJob, error: str, began: float) -> Outcome:
 
 def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> tuple[int, int]:
     """Run the unfinished steps; returns their number, and the number of frames with a verdict."""
-    # Imported here, because reports need neither recordings nor robots.
+    # Imported here, because the process that starts the workers needs neither recordings nor robots.
     from ..batch.results import write_findings
     from ..provenance import code_fingerprint, fingerprint
 

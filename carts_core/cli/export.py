@@ -91,7 +91,7 @@ class Export:
     """`named`: labels refer to the images of the recording, and formats that require images beside their labels (bop,
     voc, yolo) get copies; `copied`: copies for every format; `none`: no images. Copies are bit-identical."""
     frame_rate: float | None = None
-    """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 if it has no timestamps."""
+    """Frame rate of a video [1/s]; by default the median rate of the exported frames, or 25 without timestamps."""
     masks: Masks = "auto"
     """Masks of the formats masks, coco, yolo, voc, cvat, datumaro, rosbag2, lerobot, surgsync and recorded-csv:
     `rendered` at the corrected pose, or `refined` near their outline by the network; `auto` refines the masks of frames

@@ -38,7 +38,7 @@ class Import:
         from ..files.decoding import prepare
 
         if self.source is not None:
-            prepare()  # Loading torch takes time, so a message is displayed.
+            prepare()  # The decoder process starts while the modules below are imported.
         from ..recording.importing.found import recording_name
         from ..recording.importing.importer import import_recording, known_kinds
 

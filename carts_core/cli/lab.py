@@ -54,8 +54,8 @@ class Train(RangedOptions):
     """Folder for checkpoints, weights and the training report."""
     for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
     """Sequence file whose robots, cameras, distances and empty backgrounds the network is adapted to. Training stops
-    when validation no longer improves, after 400 steps (`--steps`), or after `--minutes` of CPU time. The weights are
-    accepted if no fit gets worse.
+    when validation no longer improves, or after `--steps` or `--minutes` of CPU time; if neither is given, after 400
+    steps. The weights are accepted if no metric of the fits gets worse.
     """
     fits: Count = 8
     """With `--for`: number of synthetic images for the comparison of fits; half as many frames of the recording are
@@ -83,7 +83,8 @@ class Train(RangedOptions):
         console.print(f"weights: {result.weights}\nreport:  {result.report}\n{result.validation}")
 
     def _adapt(self, recording: Path, console: Terminal) -> None:
-        """Adapt the shipped network to a recording; the weights are accepted if no fit is worse."""
+        """Adapt the shipped network, or that of `--start`, to a recording; the weights are accepted if no metric of
+        the fits is worse."""
         from ..lab.training.adaptation import adapted_to, gain, offer
         from ..lab.training.training import TrainingProgress, train
 

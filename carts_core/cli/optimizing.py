@@ -135,7 +135,7 @@ class FrameInputs:
 
 
 def changes(before: InputHashes, now: InputHashes) -> str | None:
-    """Description of the inputs that differ between two runs; None if the inputs recorded in both are equal."""
+    """Description of the inputs in `now` that differ from those in `before`; None if all inputs in `now` are equal."""
     different = [kind for kind in _CHANGED if kind in now and before.get(kind) != now[kind]]
     if "together" in different:
         # A change of frames implies changes of joints, images and masks.
@@ -277,7 +277,7 @@ class FrameFolder:
             new = {result.row.frame_id: result.row for result in results}
             rows = {row.frame_id: row for row in self.rows} | new
             self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
-            # A frame is complete only if all three files list it, so that a frame interrupted by a kill is repeated.
+            # The records are written last. A frame without a matching record, as after a kill, is repeated.
             write_text(self._table, kinematics_csv(self._scene, self.rows))
             known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
             # The file has one line per frame.

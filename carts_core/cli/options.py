@@ -322,7 +322,7 @@ class SolverOptions:
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """Check that the solver is `surface`, whose standard deviations `what` requires."""
+        """Check that the solver is a `SurfaceSolver`, whose standard deviations `what` requires."""
         if not isinstance(self.chosen, SurfaceSolver):
             raise SettingsError(
                 f"{what} requires --solver surface, but --solver {self.solver} was given. Remove one of the options."

@@ -93,9 +93,9 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
 
 
 _FRAMES = 4
-"""Minimum number of frames for this hint."""
+"""Minimum number of frames for `constant_correction_hint`."""
 _LARGE = 5.0
-"""Threshold for constant corrections: twice the default solver's prior standard deviation [deg, mm]."""
+"""Threshold for constant corrections [deg, mm]; for angles, twice the default solver's prior standard deviation."""
 
 
 def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:

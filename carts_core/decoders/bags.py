@@ -20,7 +20,7 @@ def topics(path: Path) -> list[tuple[str, str]]:
     """Name and message type of each topic, in the order of the bag; repeated for topics with several publishers.
 
     Raises:
-        OSError: a file of the bag is not a regular file.
+        ValueError: a file of the bag is not a regular file.
         Exception: the bag is damaged or of an unknown type; the class depends on the storage format.
     """
     return [(connection.topic, connection.msgtype) for connection in _opened(path).connections]
@@ -64,7 +64,7 @@ def rows(path: Path, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
 
 
 def image_times(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Record times [ns] and header times [s] of a topic's images; large bags with an index are only sampled.
+    """Record times [ns] and header times [s] of a topic's images; of large bags with an index, few headers are read.
 
     Raises:
         Exception: as `topics`.
@@ -134,7 +134,7 @@ def _plain(value: Any) -> Any:
 
 
 def _stamp(decoded: Any, time: int) -> float:
-    """Time in the header of a message, or the record time if there is no header [s]."""
+    """Time in the header of a message [s]; the record time if there is no header or its time is not set."""
     stamp = getattr(getattr(decoded, "header", None), "stamp", None)
     nanoseconds = time if stamp is None or stamp.sec == 0 else stamp.sec * 10**9 + stamp.nanosec
     return nanoseconds * 1e-9

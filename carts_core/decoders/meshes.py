@@ -20,13 +20,13 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class _BesideTheMesh(FilePathResolver):
-    """Resolver of a mesh's materials and textures, limited to small regular files in its folder or below."""
+    """Resolver of a mesh's materials and textures: regular files of limited size in its folder or below."""
 
     def get(self, name: str) -> bytes:
         """Content of a file.
 
         Raises:
-            OSError, ValueError: the file is missing, outside of the folder, or of an unsupported type.
+            OSError, ValueError: the file is missing, outside of the folder or too large, or an image cannot be decoded.
         """
         for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
             path = Path(self.absolute(candidate))

@@ -118,8 +118,8 @@ def evaluate(
         seed: seed of the perturbation, which is the same for a frame in all cameras and domains. In sequence mode, it
             is the same for all frames, like a calibration error.
         together: optimize all cameras jointly; the time is divided equally among their scores.
-        given: masks that are fitted. Their ignored pixels are not compared; they are the ground truth of cameras
-            without masks in the sequence.
+        given: masks that are fitted, and the ground truth of cameras without masks in the sequence. Their ignored
+            pixels are not compared.
     """
 
     for domain, group in product(domains, camera_groups(cameras, together)):

@@ -310,10 +310,11 @@ pixel.
 
 
 def write_yolo(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
-    """Write the dataset in YOLO format; each connected visible region of an arm is an object.
+    """Write the dataset in YOLO format; each connected visible region of a category is an object.
 
-    Datumaro reads YOLO boxes, but no polygons: `obj.names` and `annotations/` hold a box per category for it. Only
-    visible categories get a file, since Datumaro also reads empty files of `labels/`.
+    Datumaro reads YOLO boxes, but no polygons: for Datumaro, `annotations/` has a box per category, and `obj.names` the
+    names of the categories. Views without a visible category have no file in `annotations/`, since Datumaro also reads
+    their empty files in `labels/`.
     """
     for view in dataset.views(progress):
         stem = dataset.stems[view.id - 1]
@@ -341,7 +342,7 @@ def _yolo_line(category: Category, numbers: Float[np.ndarray, "pairs 2"]) -> str
 
 _MM = 1000.0
 _NOWHERE = [-1, -1, -1, -1]
-"""Bounding box that BOP assigns to objects outside the image."""
+"""Bounding box that BOP assigns to objects without visible pixels."""
 
 
 @dataclass(frozen=True)

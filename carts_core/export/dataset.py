@@ -230,7 +230,7 @@ class Dataset:
     images: Images = "named"
     """References to the recording's images, copies of the images, or no images, as far as the format supports it."""
     frame_rate: float | None = None
-    """Frame rate of a video [1/s]; None for the recorded rate."""
+    """Frame rate of a video [1/s]; None for the recorded rate of the exported frames."""
     masks: Masks = "rendered"
     """Masks that are refined; painted and given masks are not changed."""
     refine: "Refine | None" = None
@@ -317,7 +317,8 @@ class Dataset:
         """Yield the labelled views of all frames and cameras, one `progress` step each.
 
         Raises:
-            CartsError: a mask does not have its camera's image size, or has pixels far from any arm.
+            CartsError: a mask or painted classes do not have the camera's image size, a mask is not empty although no
+                arm is in view, or a painted class belongs to no link.
         """
         for number, (name, frame, camera) in enumerate(progress.track(self.steps), start=1):
             rendered = self.renderers[camera.name].segment_links(self.state(frame))[0]
@@ -364,8 +365,8 @@ class Dataset:
 
     @cached_property
     def files(self) -> list[Path | None]:
-        """Recorded image file of each view; None if its images are undistorted, cropped or rotated, or come from a
-        video or bag.
+        """Recorded image file of each view; None if its image is undistorted, cropped or rotated, or comes from a video
+        or bag.
         """
         return [self._file(frame, camera) for _, frame, camera in self.steps]
 
@@ -377,8 +378,8 @@ class Dataset:
 
     @cached_property
     def image_folder(self) -> Path:
-        """Folder to which image names are relative: the folder of the sequence file, else the innermost common folder
-        of all recorded images.
+        """Folder to which image names are relative: the folder of the sequence file if it contains the recorded images
+        of all exported frames, else the innermost common folder of these images.
         """
         beside = self.sequence.path.parent
         cameras = self.sequence.scene.cameras
@@ -394,7 +395,7 @@ class Dataset:
 
     def write_image(self, view: View, folder: OutputPath) -> str:
         """Write the view's image into `folder` if copies are requested or the image is not a recorded file; returns the
-        `image_name`.
+        `image_name`. Nothing is written if `images` is `none`.
 
         Recorded files are copied byte for byte; other images (see `remade_cameras`) are written as PNG.
         """
@@ -426,8 +427,8 @@ class Dataset:
 
     @cached_property
     def stems(self) -> list[str]:
-        """File stem of each view in flat folders: the stem of the recorded image if all stems differ, else the view's
-        name."""
+        """File stem of each view in flat folders: the stem of its image name if all stems differ and are valid names,
+        else the view's name."""
         own = [PurePath(name).stem for name in self._image_names]
         unique = len({stem.casefold() for stem in own}) == len(own) and not any(map(name_fault, own))
         return own if unique else [name for name, _, _ in self.steps]
@@ -455,7 +456,8 @@ def labelled(
     """Restrict `rendered` labels (-1 for background) to `mask`; additional pixels get the nearest rendered label.
 
     Raises:
-        CartsError: the mask of the view `where` has another size, or the view has no rendered label.
+        CartsError: the mask of the view `where` has another size, or is not empty although the view has no rendered
+            label.
     """
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(
@@ -487,7 +489,8 @@ def painted_links(
     classes: Int[np.ndarray, " links"],
     where: str,
 ) -> Int[np.ndarray, "height width"]:
-    """Replace `link_ids` in pixels painted as a part class (0: not painted) by the nearest rendered link of that class.
+    """Replace `link_ids` in pixels painted as a part class (0: not painted) by the nearest rendered link of that class,
+    or by its first link if none is rendered.
 
     Args:
         rendered: like `link_ids` (-1 for background), before masks were applied.

@@ -181,7 +181,8 @@ FORMATS: dict[FormatName, ExportFormat] = {
 
 
 def formats_of(sequence: Recording) -> dict[FormatName, ExportFormat]:
-    """Formats to which a sequence can be exported: those with a `source` only if it was imported from one."""
+    """Formats to which a sequence can be exported: those with a `source` only if it was imported from this
+    format."""
     source = ""
     if sequence.recording is not None:
         from ..recording.importing.importer import detect  # noqa: PLC0415 -- most sequences need no importer

@@ -33,7 +33,7 @@ class KinematicsRow:
 
     frame_id: str
     source: str
-    """Source of the values: measured, edited or optimized."""
+    """Source of the values: measured, edited, optimized or propagated."""
     joint_positions: Mapping[str, np.ndarray]
     """Arm name -> joint positions [dofs], [rad, m]."""
     joint_std: Mapping[str, np.ndarray] | None = None

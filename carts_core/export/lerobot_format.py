@@ -62,7 +62,7 @@ class _Masks:
     size: tuple[int, int]
     """Height and width [px]."""
     files: list[bytes]
-    """PNG files; the first is empty, for rows without results."""
+    """PNG files; the first is an empty mask, for rows without results."""
     shares: list[float]
     """Share of the pixels in the mask, for each of `files`."""
     rows: dict[int, int] = field(default_factory=dict)

@@ -1,7 +1,7 @@
 """Copies of the recording's CSV tables with corrected columns beside the recorded ones, and masks.
 
-A table with a row per image gets the positions of its frame. In a table with times, such as a dVRK log with more rows
-than images, the corrections of consecutive frames are interpolated linearly.
+In a table with a row per image, each row gets the positions of its frame. In a table with times, such as a dVRK log
+with more rows than images, the corrections of consecutive frames are interpolated linearly.
 """
 
 import csv

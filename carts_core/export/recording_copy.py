@@ -11,7 +11,7 @@ from ..settings import Images
 
 
 def below(folder: OutputPath, root: Path, file: Path) -> OutputPath:
-    """Path in a copy of the file of a recording."""
+    """Path of a recorded file in the copy of the recording."""
     for name in file.relative_to(root).parts:
         folder = folder / name
     return folder

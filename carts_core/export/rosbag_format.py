@@ -106,7 +106,7 @@ def _named(items: tuple[Any, ...]) -> list[tuple[Any, str]]:
 
 
 def _stamp(dataset: Dataset, view: View) -> Stamp:
-    """Times of a view: those of the message with its image, else the time since the first image."""
+    """Times of a view: those of the message with its image, else its timestamp, or its index at the frame rate."""
     sequence, index = dataset.sequence, view.frame.index
     source = sequence.image_source(view.camera.name, dataset.domain)
     source = source.source if isinstance(source, Cropped) else source

@@ -280,8 +280,8 @@ def pose_map(
 ) -> PoseMap | None:
     """Conversion of the joint positions of a PSM to recorded tip poses in any frame; None if no instrument fits.
 
-    The instrument and unit of the smallest deviation are chosen. Poses of another point of the tool are only tried if
-    those of the tip do not fit.
+    Instruments and units are tried in order; a later combination is preferred only if its deviation is less than half
+    that of the best one so far. Poses of another point of the tool are only tried if those of the tip do not fit.
 
     Args:
         values: recorded poses: position, and quaternion x y z w.

@@ -41,7 +41,8 @@ class _ArmResults:
     """Joint positions [rad, m] and jaw angle [rad], NaN without a jaw."""
     std: Float[ndarray, "frames 7"]
     poses: Mapping[str, Float[ndarray, "frames 7"]]
-    """Name in the recording -> tip poses: position [m], quaternion x y z w."""
+    """Name of the corrected poses, as in `_POSES` -> tip poses: position in the unit of the recording, quaternion x y
+    z w."""
 
 
 def write_surgsync(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
@@ -169,7 +170,7 @@ def _state(results: _ArmResults, row: int, columns: slice) -> dict[str, list[flo
 
 
 def _write_packed(root: Path, folder: OutputPath, arm: str, dataset: Dataset, results: _ArmResults) -> set[Path]:
-    """Write the table of an arm with columns for the results; returns the table."""
+    """Write the table of an arm with columns for the results; returns the rewritten file."""
     file = root / f"{arm}.parquet"
     with well_formed(f"table {file} cannot be read"):
         count = len(next(iter(decoded(tables.read_parquet, file).values())))

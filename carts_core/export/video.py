@@ -72,7 +72,7 @@ def write_video(dataset: Dataset, folder: OutputPath, progress: ExportProgress) 
 
 
 def frame_rate(dataset: Dataset) -> float:
-    """Frame rate of a video [1/s]: the given rate, else the rate of the recording, else 25."""
+    """Frame rate of a video [1/s]: the given rate, else the median rate of the exported frames, else 25."""
     times = dataset.sequence.timestamps
     if dataset.frame_rate is not None:
         return dataset.frame_rate

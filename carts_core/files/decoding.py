@@ -48,7 +48,7 @@ _PATIENCE = 20
 _IDLE = 10.0
 _MAX_IDLE_WORKERS = 4
 _MAX_FILE_BYTES = GIB
-"""Maximum temporary file of a library [bytes], in addition to a hundred times the size of the decoded file."""
+"""Maximum size of a library's temporary file [bytes], in addition to a hundred times the size of the decoded file."""
 _ARRAY, _PATH = 1, 2
 _ENVIRONMENT = {
     # Thread pools and arenas reserve address space, which counts as memory.
@@ -67,7 +67,7 @@ class Limits:
     memory: int = _MEMORY
     """Memory [bytes]."""
     written: int = _MAX_FILE_BYTES
-    """Maximum temporary file [bytes]."""
+    """Maximum size of a temporary file [bytes]."""
 
     @staticmethod
     def of(path: Path) -> "Limits":

@@ -122,7 +122,7 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
 
 
 def as_output(path: OutputPath | Path) -> OutputPath:
-    """Convert a path to an output path whose last component must not be a link."""
+    """Convert a path to an output path whose last component is not followed if it is a link."""
     if isinstance(path, OutputPath) and path.names:
         return path
     draft = isinstance(path, OutputPath) and path.draft

@@ -64,7 +64,7 @@ class ImageTraits:
 
 
 def image_traits(content: bytes) -> ImageTraits:
-    """Traits of a PNG, JPEG or TIFF image; defaults for other formats and damaged headers."""
+    """Traits of a PNG, JPEG or TIFF image; an image of another format or with a damaged header counts as upright."""
     if content.startswith(PNG):
         return _png_traits(content)
     if content.startswith(JPEG):
@@ -237,7 +237,7 @@ CACHED = Kind("cached mesh", 256 * MIB)
 
 
 class RefusedFileError(CartsError, OSError):
-    """Raised for a file that exists but is special, too large, or nested too deeply.
+    """Raised for a path that is a pipe, socket or device, for a file that is too large, and for an invalid name.
 
     It is also an `OSError`, so that callers handle it like a missing file.
     """

@@ -153,7 +153,8 @@ def fit_frame(
         SettingsError: an argument has a wrong type, shape or value.
 
     Warns:
-        UserWarning: no arm is in view, or, at the first frame of the recording, the network does not know the robot.
+        UserWarning: no arm is in view, or, in the first fit of a camera and domain, the network does not know the
+            robot.
     """
     name = sequence.scene.cameras[0].name if camera is None else camera
     frame = sequence.frame(index, domain, [name])

@@ -158,7 +158,7 @@ class ArmsInput:
     by_name: frozenset[str]
     """Arms with joint positions given by joint name."""
     remarks: tuple[str, ...]
-    """Joint positions beyond the limits of the robot."""
+    """Remarks on joint positions beyond the limits of the robot."""
 
 
 def arms_of(

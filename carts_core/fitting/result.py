@@ -47,7 +47,7 @@ class Fit:
     """
 
     image: UInt8[np.ndarray, "height width 3"]
-    """The image as given, RGB, not undistorted."""
+    """RGB image as given to `fit`, not undistorted; for `fit_frame`, the undistorted image."""
     scene: Scene
     """Arms, and the camera of the undistorted image."""
     camera: Camera

@@ -237,6 +237,7 @@ def dehazed(images: Float[Tensor, "n 3 h w"], through: Float[Tensor, "n 1 h w"])
 def certainty(through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
     """Information of each pixel of a dehazed image, relative to an image without haze [1].
 
-    Dehazing amplifies noise by the inverse of the transmission, and information is the inverse of its square.
+    Dehazing amplifies noise by the inverse of the transmission, and information is inversely proportional to the square
+    of the noise.
     """
     return through.square()

@@ -91,7 +91,7 @@ def follow(
         source: source of frames.
         tracker: tracker of the arms.
         sinks: callbacks that receive the results.
-        statistics: statistics of an earlier part of the stream, which are continued.
+        statistics: statistics to update during tracking; by default new ones.
 
     Raises:
         CartsError: the stream failed, or a frame does not fit the scene.

@@ -209,11 +209,12 @@ class Assembler:
         self._changing = threading.Lock()
 
     def moment(self, message: FrameMessage) -> StreamFrame | None:
-        """Frame completed by a message; None for a message without images, or before all joints are known.
+        """Frame completed by a message; None for a message without images, or until joints of every arm have
+        arrived.
 
         Raises:
-            StreamError: the message has an unknown arm, joint or camera, lacks an image, or has an invalid image or
-                time.
+            StreamError: the message has an unknown arm, joint or camera, lacks an image, or has an invalid image,
+                time, joint position or camera pose.
         """
         if not math.isfinite(message.time):
             raise StreamError(f"a message has the time {message.time}. Give a finite time in seconds.")

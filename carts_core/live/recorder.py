@@ -49,8 +49,8 @@ class Recorder:
 
     The folder contains `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
     corrected joints, `camera_CAMERA.csv` with the poses of each camera mount, `sequence.toml`, and at the end the
-    project `sequence.carts`. Each image is written with its rows. If the arms are lost, the measured joints are written
-    with the verdict *failed*.
+    project `sequence.carts`. The images of a frame are written before its rows. If the arms are lost, the measured
+    joints are written with the verdict *failed*.
 
     Args:
         sequence: sequence with the arms and cameras.

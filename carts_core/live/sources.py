@@ -201,7 +201,7 @@ class Replay(_Closable):
         cameras: cameras to replay.
         domain: domain to replay.
         rate: frame rate [1/s]; None for the recorded frame rate.
-        loops: number of repetitions, with timestamps that continue to increase.
+        loops: number of passes through the recording; timestamps continue to increase.
 
     Raises:
         SettingsError: the recording has no timestamps, and no rate is given.
@@ -282,8 +282,8 @@ class Camera(_Closable):
 class Folder(_Closable):
     """Watched folder with files `NAME.json` and `NAME.png`, or `NAME.CAMERA.png` for each of several cameras.
 
-    The JSON file is a frame message without images and must be written last. Only the last of several new frames is
-    read. Unusable frames are skipped with a warning.
+    The JSON file is a frame message without images and must be written last. Names must increase in
+    alphabetical order; only the last of several new frames is read. Unusable frames are skipped with a warning.
 
     Args:
         assembler: assembler of the messages.
@@ -383,7 +383,7 @@ def open_stream(
         cameras: cameras that need an image in each frame; a device is the first camera.
         domain: domain of a replay.
         rate: frame rate of a replay [1/s]; as recorded if None.
-        loops: number of repetitions of a replay.
+        loops: number of passes of a replay through the recording.
 
     Raises:
         SettingsError: a device, a folder or a port cannot be used, or a replay has no timestamps.

@@ -35,7 +35,7 @@ class LiveVerdict(StrEnum):
 
     GOOD = "good"
     DOUBTFUL = "doubtful"
-    """The fit is bad; the estimate is predicted from earlier frames."""
+    """The fit is bad and the estimate is predicted from earlier frames; or an arm out of view is detected elsewhere."""
     LOST = "lost"
     """The arms are lost; the estimate consists of the measured values with the last known correction."""
 
@@ -314,7 +314,7 @@ class LiveTracker:
     def _measured(
         self, frame: Frame, variables: Variables, errors: ErrorModel, now: float, *, found_again: bool
     ) -> tuple[_Attempt, Measurement]:
-        """Measure with the smallest sufficient effort, and start a recovery if no effort gives a good fit.
+        """Measure by colours or with small effort; after a bad fit, with greater effort, as a recovery if concurrent.
 
         Args:
             found_again: whether an earlier frame was just recovered.

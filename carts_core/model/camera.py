@@ -154,7 +154,7 @@ def implausible_intrinsics(
 def _folds(
     width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...]
 ) -> bool:
-    """Whether radial distortion is not monotonic within the image's corners."""
+    """Whether radial distortion is not monotonic between the principal point and the farthest image corner."""
     fx, fy, cx, cy = intrinsics
     k = [*distortion, *[0.0] * 8]
     reach = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)

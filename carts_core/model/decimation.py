@@ -66,7 +66,7 @@ def deviation(
     """Symmetric Hausdorff distance of two surfaces [m], measured at samples.
 
     With a tolerance, the computation is faster: a result within the tolerance is an upper bound, and a larger result is
-        a lower bound.
+    a lower bound.
     """
     first, second = vertices[faces], other_vertices[other_faces]
     moved = _farthest(first, second, tolerance)

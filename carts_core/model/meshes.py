@@ -202,7 +202,8 @@ def build_link_meshes(
         tolerance: maximum deviation of a surface [m].
 
     Raises:
-        RobotError: a mesh is degenerate, or so irregular that decimation takes too long or too many triangles remain.
+        RobotError: there are too many triangles in total, or a mesh is degenerate or so irregular that decimation takes
+            too long.
     """
     before = sum(len(mesh.faces) for _, mesh, _ in parts)
     if before > MAX_FACES:

@@ -17,7 +17,8 @@ def perturb(
 ) -> dict[str, Float[np.ndarray, " dofs"]]:
     """Move every joint by `degrees`, each with a random sign (the paper's kinematics errors).
 
-    Prismatic joints move by the same number of millimetres. Positions are clamped to the joint limits.
+    Prismatic joints move by the same number of millimetres. Positions are clamped to the joint limits;
+    a position that is already beyond a limit does not move farther out.
 
     Args:
         joint_positions: arm name -> joint positions [rad, m].

@@ -180,7 +180,7 @@ def inverse(
         (~finite, "the pose is not finite"),
         (
             finite & ~solvable,
-            "the tip lies on the wrist's yaw axis through the remote centre, where joint positions are not unique",
+            "the wrist's yaw axis passes through the remote centre, where joint positions are not unique",
         ),
     ]
     for index, (name, (low, high)) in enumerate(zip(JOINT_NAMES, geometry.limits, strict=True)):

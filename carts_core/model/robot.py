@@ -482,8 +482,8 @@ class Robot:
         link_names: links with a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
         decimation: summary of the decimation of the meshes.
-        remarks: sentences on changes to meshes (scaling by the file's unit, simplification beyond the tolerance), and
-            on ignored up axes.
+        remarks: sentences on changes to meshes (scaling by the file's unit, vertex clustering, which may exceed the
+            tolerance), and on ignored up axes.
     """
 
     def __init__(

@@ -147,7 +147,7 @@ def surface_engine(
         found = OnnxSurface(network, sha256)
         difference = _difference(network, found)
     except (RuntimeError, ImportError) as error:
-        return _without(wanted, f"ONNX Runtime cannot run the network: {error}")
+        return _without(wanted, f"it cannot run the network: {error}")
     if not difference <= TOLERANCE:
         return _without(wanted, f"its surface maps differ by {difference:.1e}, more than {TOLERANCE:.0e}")
     if wanted == "auto" and _remembered(network, sha256, found) == "torch":
@@ -156,7 +156,7 @@ def surface_engine(
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[None]:
-    """Context manager that disables TF32 for convolutions on a GPU, whose 10-bit mantissa is PyTorch's default."""
+    """Context manager that disables TF32 (10-bit mantissa), PyTorch's default for convolutions on a GPU."""
     if device.type != "cuda":
         return nullcontext()
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)

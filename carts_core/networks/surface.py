@@ -169,9 +169,7 @@ _HIDDEN = 24
 
 
 class UNetSurface(UNet):
-    """Surface network of earlier versions, whose weights are still supported: a U-Net on a standardized image and the
-    prior surface map.
-    """
+    """Surface network of the shipped weights: a U-Net on a standardized image and the prior surface map."""
 
     kind: ClassVar[str] = "surface"
 
@@ -193,4 +191,4 @@ class UNetSurface(UNet):
 
 
 AnySurfaceNetwork = SurfaceNetwork | UNetSurface
-"""Surface network of this or an earlier version."""
+"""Surface network of either architecture."""

@@ -124,7 +124,8 @@ class UnknownChange:
     deviation_between_frames: float | None
     """Standard deviation from the differences between frames (jackknife); None with one frame."""
     prior_deviation: float
-    """Standard deviation of the prior; an unknown with a similar `deviation` is not determined by the images."""
+    """Standard deviation of the prior of the settings; an unknown with a similar `deviation` is not determined by the
+    images."""
 
 
 @dataclass(frozen=True)
@@ -153,14 +154,14 @@ class CalibrationResult:
 class CalibrationOptimizer:
     """Step-wise calibration over many frames; the counterpart of `FrameOptimizer`.
 
-    If cameras and the base frames of all arms are free and no camera moves, only their product is observable; the
+    If all cameras and the base frames of all arms are free and no camera moves, only their product is observable; the
     extrinsics of the first camera are then fixed.
 
     Args:
         frames: observed images and measured joint positions.
         networks: the networks, or a predictor of surface maps.
         settings: the solver, with its `frame_prior_deg` and `intrinsics_prior`.
-        free: unknowns. Joints are free in each frame separately.
+        free: unknowns. Free joints have separate values in each frame.
         joint_prior_deg: expected error of free joints [deg].
         ignore: per frame, camera name -> pixels that show an occluder.
         cameras: names of the cameras to use, all by default.
@@ -169,8 +170,8 @@ class CalibrationOptimizer:
             in `HandEyeResult`, if more accurate than the prior of the settings.
 
     Raises:
-        SettingsError: there are no frames, no calibration parameter is free, the settings belong to another solver, or
-            an image has the wrong size.
+        SettingsError: there are no frames, `joint_prior_deg` is out of range, no calibration parameter is free, the
+            settings belong to another solver, or an image is missing or has the wrong size.
         RobotError: a camera or arm does not exist.
     """
 

@@ -134,7 +134,7 @@ class CalibrationProblem:
     """Sum of the frames' factors as a function of the calibration alone. Implements `Problem`.
 
     Args:
-        free: unknowns; joints are free in each frame separately.
+        free: unknowns; free joints have separate values in each frame.
         joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` converts it to metres.
         backgrounds: known mean backgrounds of the cameras; see `FrameProblem`.
         known_base_frames: arm -> covariance of the base frame's rotation and translation in its own axes [rad, m], if
@@ -168,7 +168,7 @@ class CalibrationProblem:
         for index, (frame, start) in enumerate(zip(frames, starts, strict=True)):
             unknowns = Variables(scene, start, free, settings.length_scale)
             own = len(unknowns) - len(self.variables)
-            # Shared across frames, so per-frame terms do not include the prior of the calibration.
+            # The prior of the calibration is shared across frames, so per-frame terms do not include it.
             precision = torch.zeros_like(unknowns.lower)
             precision[:own] = math.radians(joint_prior_deg) ** -2
             problem = FrameProblem(
@@ -237,7 +237,7 @@ class CalibrationProblem:
 
     @property
     def masked(self) -> bool:
-        """Whether given masks are the target."""
+        """Whether given masks are the target in all frames."""
         return all(part.problem.masked for part in self._parts)
 
     @property
@@ -246,13 +246,13 @@ class CalibrationProblem:
         return any(part.problem.masked for part in self._parts)
 
     def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
-        """Mean Dice of silhouettes and masks, with measured joints."""
+        """Mean Dice of silhouettes and masks over a subset of frames, with measured joints."""
         parts = self._some(_COMPARED)
         return float(np.mean([part.problem.silhouette_overlap(part.at(offsets), scale) for part in parts]))
 
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
-        """Offsets whose silhouettes are nearest to the masks in a subset of frames; the prior is replaced by the search
-        range.
+        """Offsets whose silhouettes are nearest to the masks in a subset of frames. Unless base frames are known, the
+        prior is replaced by the search range around these offsets.
         """
         parts = self._some(_COMPARED)
         compared = [(part, part.problem.silhouettes(stage.scale)) for part in parts]

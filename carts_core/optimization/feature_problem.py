@@ -40,7 +40,7 @@ def attentional_loss(
     """ACS loss of the paper (equation for L) in one of its variants, per image.
 
     Args:
-        similarity: similarity of features, at most 1; for `l1`, the negated difference of predictions.
+        similarity: similarity of features, at most 1.
         weight: attention map, in [0, 1].
         pixels: number of pixels w x h of the whole image, if the maps are a window that contains all attention.
     """
@@ -155,7 +155,8 @@ class FeatureProblem:
     def _observed_around(self, silhouette: Float[Tensor, "cameras h w"], radius: int) -> Window:
         """Window that is compared: the area of the attention, with a margin for the network.
 
-        The window changes only if it no longer contains the attention, so that observed features are computed once.
+        The window changes only if it no longer contains the attention or has become much too large, so that observed
+        features are rarely recomputed.
         """
         size = (self.renderer.width, self.renderer.height)
         if self.settings.loss is Loss.L1:

@@ -67,7 +67,8 @@ class FrameOptimizer:
     Args:
         frame: observed images and measured joint positions.
         backgrounds: camera name -> mean background BG_m. A `DescentSolver` requires all of them; a `SurfaceSolver` uses
-            them to discard false detections, and skips missing ones. `Backgrounds` caches this across frames.
+            them to discard false detections if there is one for each camera. A `Backgrounds` object caches its
+            predictions across frames.
         networks: the networks, or a predictor of surface maps.
         ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` excludes them.
         start: arm name -> joint positions to start from, the measured ones by default.
@@ -103,7 +104,9 @@ class FrameOptimizer:
         lacking = [camera.name for camera in scene.cameras if camera.name in frame.missing]
         if len(lacking) == len(scene.cameras) or (lacking and not isinstance(settings, SurfaceSolver)):
             names = ", ".join(lacking)
-            raise SettingsError(f"frame {frame.frame_id} has no image of {names}. Choose other cameras or a frame.")
+            raise SettingsError(
+                f"frame {frame.frame_id} has no image of {names}. Choose other cameras or another frame."
+            )
         self._arm_names = tuple(arm.name for arm in scene.arms)
         self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
         source = predictor_of(networks) if isinstance(settings, SurfaceSolver) else networks
@@ -135,7 +138,7 @@ class FrameOptimizer:
         self.stop_reason: StopReason | None = None
         if isinstance(self._problem, FrameProblem):
             self._problem.reset()
-        # A descent evaluates the point after its last step.
+        # A first-order descent also evaluates the point after its last step.
         budget = self.settings.iterations + int(isinstance(self._problem, FeatureProblem))
         self._fit = Fit(self._problem, torch.zeros_like(self._variables.lower), budget)
         self._points = run_stages(self.settings.stages, self._fit)
@@ -176,9 +179,9 @@ class FrameOptimizer:
         return iter(self.step, None)
 
     def comparable_losses(self) -> list[float]:
-        """Losses of all iterates that refer to the last observation.
+        """Losses of all iterates under the last observation.
 
-        The loss of an iterate refers to the observation of its stage, and is comparable only within that stage.
+        `Iterate.loss`, in contrast, refers to the observation of the iterate's stage and is comparable only within it.
         """
         problem = self._problem
         if not isinstance(problem, FrameProblem):
@@ -192,7 +195,8 @@ class FrameOptimizer:
         cameras are combined, which reduces the effect of a single camera with a wrong pose.
 
         Returns:
-            The share; None before the end, if base frames are free, or for losses without a surface factor.
+            The share; None before the end, after a run that was cancelled or did not optimize, if base frames are free,
+            or for losses without a surface factor.
         """
         ended = self.stop_reason not in (None, StopReason.CANCELLED, StopReason.NOT_OPTIMIZED)
         if not ended or self._free.base_frames or not isinstance(self._problem, FrameProblem):

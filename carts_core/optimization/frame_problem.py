@@ -178,8 +178,7 @@ class FrameProblem:
         ignore: camera name -> pixels that show an occluder.
         prior: prior of the unknowns, by default the prior of the settings.
         backgrounds: mean backgrounds of the cameras; arms predicted in them are false positives.
-        live: whether coarse stages are also compared under a fine blur for display, which increases the time by a
-            third.
+        live: whether coarse stages are also compared under a fine blur for display; see `FrameOptimizer`.
 
     Attributes:
         observation: the last observation; replaced by stages.
@@ -388,7 +387,7 @@ class FrameProblem:
         )
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
-        """Cost divided by the arm area, the mean of the rendered and the observed area.
+        """Twice the cost divided by the arm area, the mean of the rendered and the observed area.
 
         The area has the same weights as the cost, so that losses of clear and hazy images are comparable.
         """

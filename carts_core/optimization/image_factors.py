@@ -335,8 +335,8 @@ class EdgeFactor:
         """Local edge factor in the neighbourhood of a point.
 
         Args:
-            coverage: observed coverage of the arms in the whole image, at any resolution; edges outside of it are
-                ignored.
+            coverage: observed coverage of the arms in the whole image, at any resolution; edges farther than `_NEAR`
+                from it are ignored.
             weight: weight of a squared distance per outline pixel [1/px^2].
         """
         near = functional.interpolate(coverage[:, None], self._shown.shape[2:], mode="bilinear").clamp(0.0, 1.0)

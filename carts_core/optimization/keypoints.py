@@ -47,7 +47,7 @@ def fit_keypoints(
 ) -> KeypointFit:
     """Estimate the joint positions of pinned arms so that their keypoints coincide with the pins, within joint limits.
 
-    Minimizes the squared distances in the image and the squared joint motion, each over its expected error
+    Minimizes the sum of squares of the image distances and the joint motions, each divided by its expected error
     (`scipy.optimize.least_squares`). Directions not determined by pins stay near the start.
 
     Args:

@@ -1,4 +1,4 @@
-"""Evaluations of an objective, their standard deviations, and the observability of joints."""
+"""Evaluations of an objective, and standard deviations of its unknowns."""
 
 from dataclasses import dataclass, field
 
@@ -14,11 +14,11 @@ from .variables import Variables
 def uncertainty(
     variables: Variables, prior: Prior, curvature: Float[Tensor, "n n"], outline_gradient: Float[Tensor, " n"]
 ) -> Uncertainty | None:
-    """Uncertainty under the prior of the settings, from the curvature of an objective in units of its noise.
+    """Uncertainty under a prior, from the curvature of an objective in units of its noise.
 
     Args:
         prior: prior of the offsets, before the image was used.
-        curvature: J^T J / noise^2 and the prior's precision, per offset.
+        curvature: J^T J / noise^2 plus the prior's precision, per offset.
         outline_gradient: change of the gradient for one standard deviation of an error common to all outlines. This
             error does not average out, so its effect is added to that of the noise, up to the prior.
 
@@ -47,7 +47,7 @@ def uncertainty_after(
 
     Args:
         prior: prior of the offsets, before the image was used; it must constrain all of them.
-        curvature: J^T J / noise^2 and the prior's precision, per offset.
+        curvature: J^T J / noise^2 plus the prior's precision, per offset.
         moved: offsets at the optimum, minus the prior's mean.
         start_share: share of an error of the start that remains in the network's prediction [1].
     """
@@ -121,7 +121,8 @@ class Evaluation:
     hessian: Float[Tensor, "n n"] | None
     """Gauss-Newton approximation of the Hessian of `value`; None if not available."""
     uncertainty: Uncertainty | None
-    """Standard deviations from the Hessian, under the prior of the settings."""
+    """Standard deviations from the Hessian, under the prior of the problem; at the end of a fit, under the rescaled
+    prior."""
     image: Float[Tensor, "cameras 3 h w"]
     """Rendered arms, RGB, black elsewhere."""
     silhouette: Float[Tensor, "cameras h w"]

@@ -47,13 +47,14 @@ increase to full confidence [1].
 """
 
 _CONTRAST = 0.04, 0.10
-"""Lower bounds of the two values of `_NOISE` as differences, for images without noise [1]."""
+"""Lower bounds of the differences at which the confidence starts to rise and is full, for images without noise [1]."""
 
 _FOREIGN = 0.06
 """Median difference above which a background does not belong to the image [1]."""
 
 _UNINFORMATIVE = 0.15
-"""Difference above which arms are not distinguishable from other changes, such as moving smoke [1]."""
+"""Difference at full confidence above which arms are not distinguishable from other changes, such as moving smoke
+[1]."""
 
 MAX_FALSE_POSITIVES = 0.08
 """Share of a background with false positives above which the background is removed from the network's input [1]."""
@@ -146,7 +147,7 @@ def without_background(
 ) -> Float[Tensor, "cameras 3 h w"]:
     """Composite the changed pixels of images over a blurred background.
 
-    The blur extends smoothly into unknown regions, so that these have no outline.
+    Only unchanged pixels contribute to the blur, which extends smoothly into changed regions.
 
     Args:
         images: RGB in [0, 1].
@@ -265,7 +266,7 @@ class FrameImages:
     certainty: Float[Tensor, "cameras 1 h w"]
     """Information of a pixel, relative to an image without smoke and haze [1]."""
     explained: Float[Tensor, "cameras 1 h w"] | None
-    """Share of the predicted coverage explained by the empty background [1]; None if unknown."""
+    """Share of the predicted coverage explained by the empty background [1]; None if it is unknown or was replaced."""
     change: Change | None
     """Difference from the empty background; None if the background is unknown."""
     renderer: Renderer
@@ -329,7 +330,7 @@ class FrameImages:
         unit, _ = working_size(scene, settings.working_width, predictor.stride)
         size = working_size(scene, round(settings.working_width * scale), predictor.stride)
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
-        # Given masks require neither dehazing nor a background.
+        # Given masks require no background and, without a network, no dehazing.
         through = transmission(stacked, settings.dehaze if predictor.knows_parts else 0.0)
         explained, change = None, None
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):

@@ -23,8 +23,8 @@ class FramePredictor(Protocol):
 
     @property
     def masked(self) -> bool:
-        """Whether coverage comes from given masks. In this case the whole image is compared, without dehazing,
-        backgrounds or edges."""
+        """Whether coverage comes from given masks. In this case the whole image is compared, without backgrounds or
+        edges."""
         ...
 
     @property
@@ -122,8 +122,8 @@ class MaskPredictor:
     """Predictor that uses given masks instead of a network. Implements `SurfacePredictor`.
 
     Args:
-        network: predicts parts and normals inside the masks, and whole surface maps in frames without a mask; None to
-            use masks only.
+        network: predicts parts and normals inside the masks, and whole surface maps in frames in which the mask of a
+            camera is missing; None to use masks only.
         masks: frame index -> camera name -> mask at the camera's size; `Frame.masks` by default.
     """
 

@@ -47,9 +47,9 @@ _NARROW = 0.35
 _LAST = 0.25
 """Factor of `AlignRegions.odds` in the second half of the steps, since the odds of mixed colours are biased [1]."""
 _LEAST = 20
-"""Minimum number of lines of an arm in view [1]."""
+"""Minimum number of visible lines of an arm for which a likelihood is computed [1]."""
 _FEW = 0.5
-"""Pseudocount of each bin of a histogram [px], relative to a uniform distribution over all bins."""
+"""Pseudocount added to each bin of a histogram [px]."""
 _CLEAR = 0.5
 """Information of the arms' pixels relative to an image without haze, below which colours are not learnt [1]."""
 _ODDS = 2.0
@@ -214,7 +214,7 @@ class Alignment:
     """Quadratic model of the lines around the result."""
     likelihood: Float[np.ndarray, " arms"]
     """Mean log odds of the colours on both sides of each arm's outlines [1]: about 0 if the image does not show the arm
-    there, `_ODDS` if its colours occur nowhere else; NaN for an arm without outlines."""
+    there, `_ODDS` if its colours occur nowhere else; NaN for an arm with fewer than `_LEAST` visible lines."""
 
 
 class RegionImages:

@@ -44,7 +44,8 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class PoseDeviation:
-    """Standard deviations of an arm's pose in a camera's frame, at the centroid of its points."""
+    """Standard deviations of an arm's pose in a camera's frame, at the centroid of its clicked points or, in a
+    calibration from images, at its mean tip position."""
 
     rotation_deg: float
     """Rotation in the worst direction [deg]."""
@@ -87,8 +88,8 @@ class Uncertainty:
     __repr__ = short_repr
 
     def observability(self, name: str) -> Observability:
-        """Observability of an unknown: whether its standard deviation decreases to a third, slightly, or hardly at
-        all."""
+        """Observability of an unknown: whether its standard deviation decreases to less than a third, by at least a
+        tenth, or hardly at all."""
         index = self.names.index(name)
         share = self.std[index] / self.expected[index] if self.std_ratio is None else self.std_ratio[index]
         return "determined" if share < DETERMINED else "weak" if share < _VISIBLE else "not visible"
@@ -113,7 +114,7 @@ class Uncertainty:
         return replace(self, std=mixed(self.std, self.expected), std_ratio=ratio)
 
     def rescaled(self, later: "Uncertainty") -> "Uncertainty":
-        """Standard deviations under a rescaled prior; observability still refers to the original prior."""
+        """Copy of `later`, found under a rescaled prior; its observability still refers to the original prior."""
         return replace(later, std_ratio=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
 
 
@@ -177,7 +178,7 @@ class Iterate:
     loss: float
     """Loss without the prior; comparable within one observation and, if not `live`, one blur."""
     gradient_norms: dict[str, float]
-    """Gradient norm per unknown, in radian-like units."""
+    """Absolute derivative of the objective with respect to each unknown, per radian-like unit."""
     seconds: float
     """Duration of this iteration [s]."""
     arm_names: tuple[str, ...]
@@ -191,7 +192,8 @@ class Iterate:
     """Standard deviations; None for losses without curvature."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
-    """Cosine similarity of features, or 1 minus the squared difference of surface maps; at most 1."""
+    """Cosine similarity of features, 1 minus the absolute difference of predictions (`Loss.L1`), or 1 minus the squared
+    difference of surface maps; at most 1."""
 
     __repr__ = short_repr
 

@@ -149,15 +149,16 @@ class SequenceOptimizer:
     First, a few evenly spaced frames are solved individually; the first frame starts at the correction that fits all of
     these best. Each later frame starts at its predicted correction, with the covariance of the prediction as prior.
     After the last frame all corrections are smoothed backwards, and frames whose images contradict the result are
-    optimized again. Finally, all estimates are assessed. Failed frames are solved individually if only joints are free;
-    if the sequence failed, frames that still fail return to their measured values. Frames in `keyframes` are not
-    changed.
+    optimized again. Finally, all estimates are assessed. Without keyframes, failed frames are solved individually if
+    only joints are free, and if the sequence failed, frames that still fail return to their measured values. The joint
+    positions of frames in `keyframes` are not changed.
 
     Args:
         load: returns the frame at an index of the sequence, whose `measured` values are corrected.
         times: index of each frame to be corrected -> time [s], or None if unknown.
         networks: the networks, or a predictor of surface maps.
-        settings: noise, weights and working size; the stages are those of `model`.
+        settings: noise, weights, working size, and the stages by which failed frames are solved individually; all other
+            stages are those of `model`.
         model: model of the measurement error, direction and stages.
         keyframes: frame index -> arm name -> manually set joint positions [rad, m].
         keyframe_std: frame index -> arm name -> standard deviations [rad, m] of keyframes that are accepted optimizer
@@ -266,7 +267,8 @@ class SequenceOptimizer:
         """Visit the next frame; None once all frames are finished.
 
         The first steps solve a few frames individually; their results are not in `estimates`. Later steps return the
-        filtered estimate, based on the frames visited so far; `estimates` are smoothed over all visited frames.
+        filtered estimate, based on the frames visited so far; `estimates` are smoothed over all visited frames. The
+        last steps visit some frames again and assess all frames.
         """
         if self.stop_reason is not None:
             return None
@@ -301,8 +303,8 @@ class SequenceOptimizer:
         )
 
     def _assessed(self) -> Iterator[FrameEstimate]:
-        """Assess all estimates, then solve failed frames individually if only joints are free; yield each new
-        estimate."""
+        """Assess all estimates, then solve failed frames individually if there are no keyframes and only joints are
+        free; yield each new estimate."""
         failed, corrections = [], self._smoother.smoothed()
         looked = sorted(index for index, visit in self._visits.items() if not visit.measurement.by_colours)
         known: dict[int, Assessment] = {}
@@ -445,7 +447,8 @@ class SequenceOptimizer:
         return frame, Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:
-        """Frames whose measurement contradicts the smoothed correction, with the prediction from the other frames."""
+        """Frames with `Origin.CARRIED` or a measurement that contradicts the smoothed correction, with the prediction
+        from the other frames."""
         chosen = []
         for index, smoothed in self._smoother.smoothed().items():
             visit = self._visits[index]

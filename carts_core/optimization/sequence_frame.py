@@ -154,7 +154,7 @@ class SequenceFrameSolver:
         """Find the correction with the cold stages alone; without information if an arm is lost (see `arm_is_lost`).
 
         Args:
-            hypotheses: corrections [n] that are candidates for the start, besides the measured values.
+            hypotheses: corrections [n] that are further candidates of `RandomRestart`.
             cancelled: see `cold`.
         """
         prior, start = _prior(expected, variables), np.zeros(len(variables))
@@ -194,8 +194,8 @@ class SequenceFrameSolver:
         quick: bool = False,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Measurement:
-        """Find the correction, starting at the measured values; with `quick`, use smaller images except in the last
-        stages.
+        """Find the correction with the cold stages, starting at the measured values, and then the warm stages; with
+        `quick`, use smaller images in the cold stages.
 
         Raises:
             CancelledError: `cancelled` returned True after an evaluation.
@@ -441,9 +441,9 @@ class Origin(StrEnum):
     """Source of a frame's values."""
 
     WARM = "warm"
-    """Optimized from the neighbouring frame's correction."""
+    """Optimized from the correction predicted by other frames."""
     COLD = "cold"
-    """Optimized from the measured values."""
+    """Optimized from the measured values or, for the first frame, from the initial correction."""
     KEYFRAME = "keyframe"
     """Joint positions set manually."""
     CARRIED = "carried"
@@ -480,7 +480,8 @@ class FrameEstimate:
     def judged(self, assessment: Assessment, scene: Scene) -> "FrameEstimate":
         """Estimate with a verdict, and standard deviations that account for a wrong fit.
 
-        Standard deviations of keyframes, and of values predicted from other frames, are not changed.
+        Standard deviations of keyframes, of values predicted from other frames, and of frames with
+        `Assessment.nothing_there` are not changed.
         """
         if assessment.nothing_there or self.start in (Origin.KEYFRAME, Origin.CARRIED):
             return replace(self, assessment=assessment)

@@ -144,7 +144,7 @@ _SUPPORT = 0.5
 
 
 def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
-    """Whether an arm visible at the start has left the image, or is at a position where no arm was observed."""
+    """Whether an arm visible at the start has left the image, or most of its silhouette was not observed as arm."""
     seen, images = problem.observation, problem.observation.images
     before, after = (problem.variables.state(point) for point in (problem.start, offsets))
     start, end = (images.renderer.segment(state) for state in (before, after))
@@ -317,7 +317,7 @@ def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
     kept, known = fit.stop_reason is StopReason.START_KEPT, fit.best_of_descent
     point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
-        # Edges have no uncertainty model, so the uncertainty of the last descent is kept.
+        # Edges have no uncertainty model, so the uncertainty is derived from the last descent.
         before = known.evaluation
         evaluation = replace(point.evaluation, gradient=before.gradient)
         if isinstance(fit.problem, FrameProblem):
@@ -351,7 +351,7 @@ def run_retry_other_background(stage: RetryOtherBackground, fit: Fit) -> Iterato
 
 @run_stage.register
 def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
-    """Assess the best point; return to the start if it failed and the start fits better, or if no arm is visible."""
+    """Assess the best point; return to the start if it failed and the start fits no worse, or if no arm is visible."""
     problem, found = _one_frame(fit), fit.best
     if found is None:
         return

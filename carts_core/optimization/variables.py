@@ -155,7 +155,7 @@ class Variables:
 
     @property
     def groups(self) -> list[range]:
-        """Index ranges of unknowns of the same arm's joints, the same base frame, or the same camera."""
+        """Index ranges of the joints of an arm, a base frame, and the extrinsics and the intrinsics of a camera."""
         return [range(block.start, block.start + block.size) for block in self._blocks]
 
     @property

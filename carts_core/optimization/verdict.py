@@ -97,11 +97,12 @@ class Evidence(ArmEvidence):
     start_area: float
     """Area of the rendered arms at the start, as a share of the images [1]."""
     loss: float
-    """Cost of the surface factor per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
+    """Loss of the surface factor per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
     predicted: float
     """Share of the rendered arms' area that the unconditioned network also predicts as arms [1]."""
     changed: float | None
-    """Share of the rendered arms that differs from the mean background [1]; None if the background is unknown."""
+    """Share of the rendered arms that differs from the mean background [1]; None if the background is unknown or
+    uninformative."""
     still_in_view: float = 1.0
     """Minimum ratio of an arm's area to its area at the start, over the arms initially in view [1]; parts occluded by
     another arm count as in view.
@@ -122,7 +123,7 @@ class Evidence(ArmEvidence):
 def evidence(
     images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
-    """Compute image evidence for and against a fit; runs the predictor twice."""
+    """Compute image evidence for and against a fit; runs the predictor twice, three times if an arm is out of view."""
     maps = images.renderer.surface_maps(end)
     covered = maps[:, COVERAGE].sum(1, keepdim=True)
     margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
@@ -247,7 +248,7 @@ class Assessment:
     """Probability that the mask is wrong (Dice below 0.9), calibrated on frames with ground truth [1]."""
     evidence: Evidence
     nothing_there: bool = False
-    """Whether no arm is in view or detected."""
+    """Whether an arm is missing from the image or not detected, or the given mask is unusable."""
 
     @property
     def negligible_risk(self) -> bool:
@@ -331,7 +332,8 @@ _LOOKS_LIKE_ONE = 5e-3
 """Share of the images above which a prediction elsewhere may be the arm that is out of view [1]."""
 
 _MOST, _MORE = 0.5, 2.0
-"""Share of the images, and multiple of the measured arms' area, above which a given mask does not show arms [1]."""
+"""Area of the arms fitted to a given mask, as a share of the images and as a multiple of their area at the start, above
+which the mask does not show arms [1]."""
 
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (

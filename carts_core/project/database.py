@@ -220,7 +220,7 @@ def harden(connection: sqlite3.Connection) -> sqlite3.Connection:
 
 
 def _authorized(action: int, _first: object, _second: object, _schema: object, inside: str | None) -> int:
-    """SQLite authorizer that denies actions not used by CaRTS, and actions of foreign triggers and views."""
+    """SQLite authorizer that denies the actions in `_NEVER`, and actions of foreign triggers and views."""
     return sqlite3.SQLITE_DENY if action in _NEVER or inside not in (None, "current") else sqlite3.SQLITE_OK
 
 

@@ -41,8 +41,8 @@ def check_files(path: Path) -> bool:
     """Check a project and its companion files before opening them; returns whether the project exists.
 
     Raises:
-        ProjectError: a file is a link, has a second hard link or is not a regular file; or another program left a
-            journal that SQLite would apply.
+        ProjectError: a file is a link, has a second hard link or is not a regular file; another program left a journal
+            that SQLite would apply; or there is a log without its project.
         OSError: the folder cannot be read.
     """
     there = _is_there(path)
@@ -165,7 +165,7 @@ def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
     """Yield each complete frame: page number, database size [pages] if the frame commits a transaction (else 0), and
     page.
 
-    The last item is None if the last frame or the header is damaged.
+    If a frame or the header is damaged, the last item is None, and the following frames are not read.
     """
     if len(log) < HEADER:
         # The header is written first and in one call, so it is incomplete only if the process was killed during this
@@ -256,7 +256,7 @@ def read_files(path: Path) -> Content:
             after = os.fstat(descriptor)
         finally:
             os.close(descriptor)
-        # A writer appends to the log, and checkpoints a large log into the file, as well as when closing the file.
+        # A writer appends to the log, and checkpoints it into the file if the log is large or the file is closed.
         if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
             return Content(main, log)
     raise ProjectError(f"project {path} is changing continuously. Try again later.")

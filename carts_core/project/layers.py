@@ -133,7 +133,7 @@ def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height wid
 
 
 def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:
-    """PNG file without filters, which for masks is encoded and decoded faster."""
+    """Encode an image as PNG without filters; masks are then encoded and decoded faster."""
     ok, data = cv2.imencode(".png", pixels, _UNFILTERED)
     if not ok:
         raise ProjectError(f"a painted layer of shape {pixels.shape} could not be written as PNG.")

@@ -134,7 +134,7 @@ class ImportReport:
     keypoints: int
     """Number of images with keypoints."""
     labels: tuple[str, ...]
-    """Labels of the masks."""
+    """Labels of all imported masks of the project."""
     unknown: tuple[str, ...]
     """Names of images without a matching frame."""
     changed: bool
@@ -169,8 +169,8 @@ def import_annotations(
         replace: whether previously imported layers may be replaced.
 
     Raises:
-        ProjectError: no annotation matches a frame, or a layer would be replaced without permission. In both cases
-            nothing is changed.
+        ProjectError: no annotation matches a frame, a layer would be replaced without permission, or the project would
+            have too many labels. In these cases nothing is changed.
         SequenceError: the source cannot be read.
     """
     state = project.state

@@ -136,7 +136,8 @@ class ProjectState:
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """Edits that change values, and the given verdicts on changed poses even if the verdicts are unchanged.
+        """Edits that change values. A given verdict equal to the stored one is included if it is outdated, or if the
+        inputs of its frame's fit change.
 
         Changing an accepted frame withdraws its acceptance in the same step, unless an edit sets its review.
         """

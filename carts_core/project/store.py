@@ -305,7 +305,8 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
 
 
 def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
-    """Read the state of the project of a sequence, or of any sequence; errors are those of `open_or_begin`."""
+    """Read the state of the project of a sequence, or of any sequence; errors are those of `open_or_begin`, but the
+    content of a damaged project is not saved."""
     memory, state, _ = _load(path, identity, keep_what_is_left=False)
     memory.close()
     return state
@@ -313,7 +314,7 @@ def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
 
 def _begin(path: Path, identity: SequenceIdentity) -> None:
     try:
-        # Another process that creates the file concurrently writes the same content.
+        # If another process creates the file concurrently, its empty project is used.
         write_new(path, file_content(database.empty(identity)))
     except OutputError as error:
         if isinstance(error.__cause__, OSError):

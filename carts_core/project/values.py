@@ -38,7 +38,8 @@ class Provenance:
     """Origin of a value, with settings and weights.
 
     Raises:
-        ProjectError: a value of the optimizer lacks settings, settings are not JSON, or a hash is invalid.
+        ProjectError: a value of the optimizer lacks settings or a required hash, settings are not JSON, or a hash is
+            invalid.
     """
 
     source: Source
@@ -96,7 +97,7 @@ class JointCorrection(JsonValue):
     """Joint positions of one arm in one frame. All sequences of numbers are accepted, and stored as tuples.
 
     Raises:
-        ProjectError: a number is not finite, or the lengths differ.
+        ProjectError: a joint position is not finite, a standard deviation is negative, or the lengths differ.
     """
 
     joint_positions: tuple[float, ...]
@@ -369,7 +370,7 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.IMPORTED_LABELS: ImportedLabels,
 }
 CALIBRATION = frozenset({Kind.BASE_FRAME, Kind.EXTRINSICS, Kind.INTRINSICS, Kind.TIME_OFFSET})
-"""Kinds of values that apply to all frames and affect the pose of the arms."""
+"""Kinds of values that apply to all frames and affect the rendered arms."""
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
 _IMPORTED = {Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS}

@@ -22,7 +22,8 @@ _MAX_ERROR = 3
 """Maximum error of measured kinematics, in margins [1]."""
 
 _STAYS = 0.4
-"""Share of an arm's silhouette that is covered in all views, above which the arm is considered immobile [1]."""
+"""Area covered in all views, relative to the mean area covered in a view, above which the arms are considered
+immobile [1]."""
 
 _FEWEST = 3
 """Minimum number of views whose agreement makes a pixel known [1]."""
@@ -67,8 +68,8 @@ def background_of_recording(
     """Mean background of a recording: the median of each pixel over the views in which no arm covers this pixel.
 
     Pixels covered in every view are filled in from their surroundings. A pixel is known if the arms are far from it in
-    most views of its median, or if many views agree, since an arm that is visible because of inaccurate kinematics
-    would move and change its shading.
+    most views of its median, or if at least three views agree, since an arm that is visible because of inaccurate
+    kinematics would move and change its shading.
 
     Args:
         scene: scene with the camera.
@@ -91,8 +92,8 @@ def background_of_recording(
     problem = None
     if always > _STAYS * usually:
         problem = (
-            f"camera {camera!r}: the background behind the arms is unknown, since they hardly move in {len(arms)} "
-            "views, and may contain an arm. Add a `background` image without arms to the sequence file."
+            f"camera {camera!r}: the background behind the arms is unknown and may contain an arm, since the "
+            f"arms hardly move in {len(arms)} views. Add a `background` image without arms to the sequence file."
         )
     return MeanBackground(estimate, (2 * clear > used) | agree, problem)
 

@@ -95,7 +95,7 @@ class FrameList:
     counted: str
     """Number of frames, as a clause for errors, such as "the kinematics table has 3 rows"."""
     table: Table | None = None
-    """Table with one row per frame; None for all frames of a video."""
+    """Table with one row per frame; None for all frames of a video, and for a selection of frames."""
 
     def __post_init__(self) -> None:
         if len(self.frame_ids) > MAX_FRAMES:

@@ -33,7 +33,7 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2RGB),
-    # ROS names Bayer patterns by the first two pixels of the first row, OpenCV by those of the second row.
+    # ROS names Bayer patterns by the first 2 x 2 pixels, OpenCV by the second and third pixels of the second row.
     "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
     "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
     "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),

@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 
 class ByteCache(Generic[T]):
-    """Least-recently-used cache with a limit in bytes; thread-safe, and each value is computed only once.
+    """Least-recently-used cache with a limit in bytes; thread-safe. Concurrent requests compute a value only once.
 
     Args:
         limit: memory [bytes]; a single value may be larger.
@@ -104,7 +104,7 @@ _HEADER = 2**18
 DEPTHS = (8, 10, 12, 14, 16)
 """Bit depths of cameras."""
 _SAMPLED, _SAMPLED_MASKS = 12, 2
-"""Number of images per camera in which the bit depth is measured, and number of masks checked for grey borders, when a
+"""Number of images per camera in which the bit depth is measured, and number of masks checked for remarks, when a
 sequence is opened."""
 _NEAR = 16
 """Distance from black or white within which values of compressed masks count as black or white."""
@@ -160,7 +160,7 @@ class ImageFiles:
         return read_image(self.files[index], self.bits)
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the file and, for images of more than 8 bits, of the bit depth."""
+        """SHA-256 of the file and, unless it is a JPEG or a PNG of at most 8 bits, of the bit depth."""
         content = read_file(self.files[index])
         eight_bits = content.startswith(JPEG) or (content.startswith(PNG) and content[24:25] != b"\x10")
         return hashlib.sha256(content + (b"" if eight_bits else bytes([self.bits()]))).hexdigest()
@@ -172,7 +172,7 @@ class ImageFiles:
         return self._counted
 
     def upright(self, index: int) -> bool:
-        """Whether the stored pixels are used without an EXIF rotation; also True for a missing file."""
+        """Whether the stored pixels are used without an EXIF rotation; also True for an unreadable file."""
         traits = _header(self.files[index])
         return traits is None or traits.orientation == 1
 
@@ -188,8 +188,8 @@ class ImageFiles:
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image file as RGB, rotated by its EXIF orientation; `bits` is the bit depth of 16-bit files, by default
-    the depth in use."""
+    """Read an image file as RGB, rotated by its EXIF orientation; `bits` returns the bit depth of 16-bit files, by
+    default the smallest one that contains the values of the image."""
     return _eight_bits(_decode(path, colour=True), f"image {path}", bits)
 
 
@@ -242,7 +242,7 @@ class LabelImage:
     """Label image with a value or a colour per pixel, or mask."""
 
     mask: Bool[np.ndarray, "height width"] | None
-    """White pixels; None for an image with labels."""
+    """Instrument pixels; None for an image with labels."""
     values: np.ndarray | None
     """Grey values in full depth, or palette indices [height, width]; None for colours."""
     colours: UInt8[np.ndarray, "height width 3"]

@@ -104,12 +104,13 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
     except (OSError, ValueError, csv.Error) as error:
         raise SequenceError(f"{what} {path} is not a readable CSV file: {error}.") from error
     if len(rows) < 2:
-        raise SequenceError(f"{what} {path} has no rows. It needs a header and one row per frame.")
+        raise SequenceError(f"{what} {path} has no rows. It needs a header and at least one row.")
     header = tuple(name.strip() for name in rows[0])
     if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
         raise SequenceError(
             f"the cells of {path} are not separated by {delimiter!r}, but probably by {found!r}. "
-            f"Set `delimiter = {found!r}` in [kinematics]; the decimal separator must be a point."
+            f"Set `delimiter = {found!r}` in [kinematics], or in [frames] for a table of frames; the decimal separator "
+            "must be a point."
         )
     repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if repeated:

@@ -254,7 +254,7 @@ POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 _NORM_TOLERANCE = 0.01
 """Maximum deviation of a quaternion's norm from 1."""
 _FARTHEST = 100.0
-"""Maximum distance of the mount from the origin [m]."""
+"""Maximum absolute coordinate of a pose's position [m]."""
 
 
 def take_camera_motion(table: TomlTable, rows: Rows) -> Samples | None:
@@ -294,9 +294,8 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
         )
     if (far := np.flatnonzero(~(np.abs(positions).max(1) <= _FARTHEST))).size:
         raise table.error(
-            f": the camera is {np.abs(positions[far[0]]).max():.4g} m away; at most {_FARTHEST:g} m is allowed. If the "
-            "columns "
-            'are in mm, set length_unit = "mm".',
+            f": a coordinate of the position is {np.abs(positions[far[0]]).max():.4g} m; at most {_FARTHEST:g} m is "
+            'allowed. If the columns are in mm, set length_unit = "mm".',
             far[0],
         )
     Ts = np.tile(np.eye(4), (len(table), 1, 1))

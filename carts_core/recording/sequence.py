@@ -76,7 +76,7 @@ class Sequence:
     Attributes:
         path: the sequence file.
         name: name of the recording.
-        scene: calibrated arms and cameras, without distortion.
+        scene: calibrated arms and cameras; the cameras project to undistorted images.
         domains: variants of every image; the first is the default.
         frame_ids: id of each frame.
         timestamps: acquisition time of each image [frames] [s], or None.
@@ -85,7 +85,7 @@ class Sequence:
         measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
         truth: arm -> true joint positions of all frames, for arms with ground truth; None without ground truth.
         remarks: sentences on changes to images and masks before they are used (rotation, scaling to 8 bits,
-            deinterlacing), and on unusual calibrations.
+            deinterlacing), on unusual calibrations, on robots, and on omitted frames.
         recording: file or folder of the foreign recording that was imported, or None; it may be missing.
     """
 
@@ -270,8 +270,8 @@ class Sequence:
         return self.matching
 
     def recorded_camera(self, name: str) -> Camera:
-        """Camera of the recorded images, with their distortion, unlike in `scene`; `SequenceError` for an unknown
-        name."""
+        """Camera as calibrated in the sequence file, even if `corrected` replaced `scene`, with the distortion of the
+        recorded images; `SequenceError` for an unknown name."""
         return self._camera(name).camera
 
     def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
@@ -279,8 +279,8 @@ class Sequence:
         return self._camera(camera).images[self._domain(domain)]
 
     def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
-        """File that contains a frame's image unchanged; None if the image is undistorted, cropped, rotated, or decoded
-        from a video or a bag. `SequenceError` for an unknown camera or domain."""
+        """File with the pixels of a frame's image, in full bit depth; None if the image is missing, undistorted,
+        cropped, rotated, or decoded from a video or a bag. `SequenceError` for an unknown camera or domain."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
         changed = any(entry.camera.distortion) or index in entry.missing
@@ -301,7 +301,7 @@ class Sequence:
         return None if path is None else hashlib.sha256(read_file(path)).hexdigest()
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
-        """Whether the sequence file has masks for a camera, optionally in a domain or for one frame."""
+        """Whether a camera has masks in a domain (the first by default), or a mask of the frame `index`."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         return masks is not None and (index is None or masks[index] is not None)
 
@@ -402,7 +402,7 @@ class Sequence:
 
 
 AHEAD = 8
-"""Number of frames to prefetch."""
+"""Maximum number of frames to prefetch in the direction of travel."""
 MAX_STRIDE = 10
 """Maximum step between frames from which the direction of travel is inferred."""
 
@@ -410,7 +410,7 @@ MAX_STRIDE = 10
 class FrameReader:
     """Reads frames and prefetches their neighbours in the direction of travel into the sequence's cache, on a thread.
 
-    A jump to another frame discards the queue. Errors of prefetched frames are ignored, since reading these frames
+    Each call of `frame` replaces the queue. Errors of prefetched frames are ignored, since reading these frames
     raises them again. The thread ends when the queue is empty.
     """
 

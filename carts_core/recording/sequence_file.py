@@ -135,7 +135,7 @@ class CameraInput:
     camera: Camera
     images: Mapping[str, ImageSource]
     masks: Mapping[str, tuple[Path | None, ...]]
-    """Mask file of each frame, None for frames without a mask; empty for a sequence without masks."""
+    """Domain -> mask file of each frame, None for frames without a mask; empty for a camera without masks."""
     background: Mapping[str, Path]
     motion: Samples | None
     """Poses of the camera mount; None for a static camera."""
@@ -185,7 +185,7 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
             raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
         background[domain] = path
     if background and motion is not None:
-        raise table.error("background", "cannot be combined with `motion`: backgrounds of a moving camera differ.")
+        raise table.error("background", "cannot be combined with `motion`: the background then differs between frames.")
     table.finish()
     return CameraInput(camera, images, masks, background, motion, missing)
 
@@ -323,7 +323,8 @@ class Description:
     cameras: Mapping[str, CameraInput]
     arms: Mapping[str, ArmInput]
     remarks: tuple[str, ...] = ()
-    """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
+    """Remarks on changes to images and masks before they are used, on unusual calibrations, on robots, and on omitted
+    frames."""
     recording: Path | None = None
     """File or folder of the foreign recording that was imported; None if not stated. It need not exist."""
 

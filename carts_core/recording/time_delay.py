@@ -35,7 +35,7 @@ _BLOCKS = 10
 _GRID = 0.02
 """Spacing of the initial grid of delays [s]."""
 _NEAR = 0.05
-"""Range of the refinement around a delay of the grid [s]."""
+"""Half-width of the range of the refinement around a delay [s]."""
 _EQUAL, _SIMILAR = 0.1, 0.25
 """Maximum relative excess of unexplained flow of equally good delays, and of candidates before all predictors are
 used."""
@@ -52,7 +52,7 @@ _KEPT = 1e-4
 _POSTURES = 3
 """Number of principal directions of link positions that modulate the flow."""
 _RIDGE = 1e-2
-"""Weight of the prior that flow per motion is equal in all directions."""
+"""Weight of the ridge penalty on regression coefficients, relative to the mean diagonal entry of X^T W X [1]."""
 _SPARE = 2.0
 """Time before and after the search range for which rows are used [s]."""
 _LEVER = 0.1
@@ -60,7 +60,7 @@ _LEVER = 0.1
 _MIN_KNOWN_FRACTION = 0.5
 """Minimum share of the steps with logged rows."""
 _STILL = 0.02
-"""Minimum flow that counts as motion [px]."""
+"""Minimum root mean square of the flow that counts as motion [px at `WIDTH`]."""
 _MIN_EXPLAINED, _MIN_GAIN = 0.15, 0.1
 """Minimum share of flow explained by the best delay, and its minimum relative reduction of the unexplained share
 compared with the median over the delays."""
@@ -330,7 +330,7 @@ class _Delays:
         return shifts, self._share(shifts)
 
     def _curve(self, shifts: list[float | None], moved: list[int]) -> dict[float, float]:
-        """Share explained at each common shift of the clocks `moved`; without shifts at which rows are missing.
+        """Share explained at each common shift of the clocks `moved`; without shifts at which most steps lack rows.
 
         Predictors are those of a constant posture: they are less accurate and less ambiguous in periodic motion.
         """
@@ -338,7 +338,7 @@ class _Delays:
         return {shift: share for shift, share in shares.items() if np.isfinite(share)}
 
     def _share(self, shifts: list[float | None]) -> float:
-        """Share of the flow in held-out blocks explained with a constant posture; minus infinity without rows."""
+        """Share of the flow in held-out blocks explained with a constant posture; minus infinity if most lack rows."""
         logged = self._logged(shifts)
         if logged.mean() < _MIN_KNOWN_FRACTION:
             return -np.inf

@@ -41,7 +41,7 @@ class TomlTable:
         self._known: list[str] = []
 
     def name(self, key: str) -> str:
-        """Full name of a key for errors, such as `sequence.toml: [cameras] 'left': size`."""
+        """Full name of a key for errors, such as `sequence.toml: [[cameras]] 'left': size`."""
         return f"{self.file}: {self.where + ': ' if self.where else ''}{key}"
 
     def error(self, key: str, text: str) -> SequenceError:

@@ -1,6 +1,6 @@
 """Interactive segmentation: protocol of segmenters, and the built-in segmenter.
 
-`onnx_segmenter` loads SAM-type models; only this module requires ONNX Runtime.
+`onnx_segmenter` loads SAM-type models; it is the only module of this package that requires ONNX Runtime.
 """
 
 from .segmenter import NetworkSegmenter as NetworkSegmenter

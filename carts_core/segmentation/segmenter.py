@@ -173,7 +173,7 @@ class _Places:
 
     def chosen(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         """Connected components selected by the prompt: components with a foreground point, or all except tiny
-        components in a box."""
+        components in a box; components with a background point are omitted."""
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         kept = {int(labels[v, u]) for u, v in self.inside}
         if not self.inside and count > 1:

@@ -39,7 +39,7 @@ class StreamAddress:
     place: str = ""
     """Device number, file, folder or port."""
     joints_port: int | None = None
-    """With a camera or video: port on 127.0.0.1 for joints and results."""
+    """Port on 127.0.0.1 for joints and results: required for a camera or video, optional for a folder."""
 
     @classmethod
     def parse(cls, text: str, joints_port: int | None = None) -> "StreamAddress":
@@ -90,7 +90,7 @@ class LiveSettings(Ranged):
     bad_loss: Annotated[float, Range(1e-3, 10)] = 0.06
     """Loss above which a fit is bad [1]."""
     bad_factor: Annotated[float, Range(1, 100)] = 2.5
-    """Multiple of the usual loss above which a fit is also bad [1]."""
+    """Multiple of the usual loss above which a fit is also bad [1]; this bound is at least half of `bad_loss`."""
     lost_seconds: Seconds = 0.25
     """Duration of bad fits after which the arms are lost [s]."""
     search_seconds: Seconds = 0.4

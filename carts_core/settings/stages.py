@@ -178,7 +178,8 @@ class Evaluate:
 @dataclass(frozen=True)
 class RejectFailed:
     """Assess the best point as good, doubtful or failed. Unless it is good, its standard deviations account for a wrong
-    fit. If it failed, return to the start, unless the start fits the image even less."""
+    fit. If it failed, return to the start, unless arms are visible and the start fits the
+    image even less."""
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class DomainConfig(Ranged):
     blood_on_tools: Share = 0.30
     """Fraction of the instruments' surface with a film or drops of blood."""
     smoke_density: Annotated[float, Range(0.0, 200.0)] = 8.0
-    """Mean extinction of the smoke [1/m]; with 8, 55 % of the light is lost at a depth of 0.1 m."""
+    """Mean extinction of the smoke [1/m]; with 8, about 60 % of the light from a depth of 0.1 m is lost."""
     smoke_wavelength: Annotated[float, Range(0.002, 1.0)] = 0.042
     """Size of the largest eddies [m]."""
     smoke_speed: Share = 0.02
@@ -153,8 +153,8 @@ class SynthesisConfig(Ranged):
     robot: Path = field(default_factory=shipped_robot)
     """URDF, or `builtin:NAME`. A robot with the joints of a PSM is used for two arms, other robots for a single arm."""
     tip_link: str = "tool_tip_link"
-    """Link of the URDF whose origin is the point between the jaw tips; for robots other than the PSM, the last link
-    with a mesh."""
+    """Link of the URDF whose origin is the point between the jaw tips; for robots other than the PSM, by default the
+    last link with a mesh."""
     domains: tuple[str, ...] = DOMAINS
     """Conditions to render."""
     endoscope: EndoscopeConfig = EndoscopeConfig()

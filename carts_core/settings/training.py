@@ -21,8 +21,8 @@ class ObjectiveWeights(Ranged):
     dice: NotNegative = 0.5
     """One minus soft Dice per image, so that small instruments have the same weight as large instruments."""
     consistency: NotNegative = 1.0
-    """Cosine similarity of features of an observed and a hybrid image, with the target 1 for equal and 0 for different
-    classes."""
+    """Cosine similarity of features of an observed and a hybrid image, with the target 1 for equal classes, at most 0
+    for background and instrument, and at most 0.6 for shaft and head."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ class AppearanceRanges(Ranged):
     """Ranges of the random image appearance of observed training images.
 
     Smoke, blood and low light are deliberately excluded, since robustness to these conditions is evaluated instead of
-        trained: nothing red is drawn over an instrument, no part of the image is hidden, and `brightness` has a lower
-        bound.
+    trained: nothing red is drawn over an instrument (unless `ImageSettings.blood` is positive), no part of the image is
+    hidden, and `brightness` has a lower bound.
     """
 
     brightness: Interval = (0.65, 1.35)
@@ -175,7 +175,8 @@ class AppearanceRanges(Ranged):
     vignette: Interval = (0.0, 0.45)
     """Darkening in the image corners [1]."""
     unevenness: Share = 0.4
-    """Maximum deviation of the logarithm of the illumination over the image [1]; its mean is unchanged."""
+    """Maximum standard deviation of the logarithm of the illumination over the image [1]; the mean illumination is
+    unchanged."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -253,7 +254,7 @@ class TrainingConfig(Ranged):
     """Settings of a training run."""
 
     network: NetworkName = "feature"
-    """Network to train: `feature` for the paper's loss, `surface` for Gauss-Newton."""
+    """Network to train: `feature` for losses of image features, `surface` for `SurfaceSolver`."""
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
     """URDF files of the robots in the training images, or `builtin:NAME`."""
     start: Path | None = None
@@ -273,7 +274,7 @@ class TrainingConfig(Ranged):
     """Folder of training images of the surface network; missing images are generated before the first step. By default,
     images are generated during training."""
     cached: Count = 60_000
-    """Number of images in `cache`."""
+    """Number of images in `cache`, rounded up to a multiple of 250."""
     learning_rate: Positive = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
     encoder_rate: Share = 0.3
@@ -393,7 +394,7 @@ class BaselineTraining(Ranged):
     """Safetensors file with encoder weights from timm, such as pretrained weights; for a U-Net, a file with a feature
     network. By default random weights."""
     frames: Annotated[int, Range(101)] = 3000
-    """Number of synthetic frames; the last 100 are used for validation."""
+    """Number of synthetic frames, rounded up to a multiple of 250; the last 100 are used for validation."""
     steps: Count = 20_000
     """Optimizer steps."""
     minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None

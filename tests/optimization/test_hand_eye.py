@@ -150,7 +150,7 @@ def test_the_focal_length_is_estimated_on_request(scene: Scene, measured: dict[s
 def test_what_is_missing_is_counted(scene: Scene, measured: dict[str, np.ndarray]) -> None:
     points = clicked(scene, measured, range(2), ["left"], noise=0.0)
     first = [point for point in points if point.arm == "PSM1"]
-    with pytest.raises(SettingsError, match=r"PSM1 needs 1 more point in left.*Shaft edges are not counted"):
+    with pytest.raises(SettingsError, match=r"PSM1 needs 1 more point in left.*Points on the shaft are not counted"):
         solve_hand_eye(unknown(scene), measured, [point for point in first if point.landmark != "shaft edge"][:3])
     with pytest.raises(SettingsError, match=r"there are no points. Click tip"):
         solve_hand_eye(unknown(scene), measured, [])

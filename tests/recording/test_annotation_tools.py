@@ -442,7 +442,7 @@ def test_names_of_yolo_are_found_above_the_labels_unless_confined(sequence: Sequ
         ("0 0.1 0.1 0.2 0.2 0.3 0.3 0.9", "7 numbers are not x and y of vertices; export without confidences"),
         ("0 nan 0.1 0.2 0.2 0.3 0.3", "a vertex is not finite"),
         ("0 10 10 50 50 30 30", "or not normalized"),
-        ("7 0.1 0.1 0.2 0.2 0.3 0.3", "class 7 has no name in data.yaml"),
+        ("7 0.1 0.1 0.2 0.2 0.3 0.3", "class 7 has no name in the file of class names"),
         ("a b c d e f g", "left out"),
         ("0 " + "0.1 0.2 " * 100_001, "a polygon has 100001 vertices"),
     ],
@@ -491,7 +491,7 @@ def test_folders_with_several_formats_ask_for_one(sequence: Sequence, tmp_path: 
         read(tmp_path, sequence, camera="left")
     assert list(read(tmp_path, sequence, camera="left", format="labelme")[0]) == [(0, "left")]
     assert list(read(tmp_path, sequence, camera="left", format="masks")[0]) == [(1, "left")]
-    with pytest.raises(SequenceError, match="is a folder, but the format coco is a file"):
+    with pytest.raises(SequenceError, match="is a folder, but an export in the format coco is a file"):
         read(tmp_path, sequence, format="coco")
     with pytest.raises(SequenceError, match="has the format labelme, not coco"):
         read(tmp_path / "001.json", sequence, format="coco")

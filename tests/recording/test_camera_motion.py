@@ -122,7 +122,7 @@ def _set(row: int, column: int, text: str) -> Callable[[list[list[str]]], object
         (lambda rows: rows.pop(), "has 3 rows, but the kinematics table has 4"),
         (_set(2, 0, "9"), "line 3 is frame '009', but the kinematics table has frame '002'"),
         (_set(2, 4, "0.9"), "the norm of the quaternion is .* must be 1"),
-        (_set(2, 1, "812.5"), "the camera is 812.5 m away; at most 100 m is allowed.*length_unit"),
+        (_set(2, 1, "812.5"), "a coordinate of the position is 812.5 m; at most 100 m is allowed.*length_unit"),
         (_set(2, 1, "nan"), "'nan' is not a finite number"),
         (_set(0, 1, "X"), "no column 'x', which .*motion: position"),
     ],

@@ -175,7 +175,7 @@ def test_a_missing_sequence_file_and_a_folder_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("", ["has no rows", "a header and one row per frame"]),
+        ("", ["has no rows", "a header and at least one row"]),
         ("frame,yaw\n", ["has no rows"]),
         ("frame;yaw\n1;2\n", ["not separated by ','", "delimiter = ';'"]),
         ("frame,yaw,yaw\n1,2,3\n", ["duplicate columns: 'yaw'"]),

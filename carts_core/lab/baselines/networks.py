@@ -149,7 +149,7 @@ class _TwoEncoders(nn.Module):
 
 
 def _made(settings: BaselineNetwork, make: Any) -> Any:
-    """Result of `make`; raises `SettingsError` for an encoder that timm does not provide."""
+    """Result of `make`; raises `SettingsError` if timm lacks the encoder or it does not work in the baseline."""
     import timm  # noqa: PLC0415
 
     if not timm.is_model(settings.timm_encoder):

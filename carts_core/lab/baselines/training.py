@@ -139,7 +139,7 @@ def _warped(name: Augmentation) -> Change:
 SIZE = (256, 192)
 """Width and height of a training frame [px], which is a whole image."""
 IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
-"""Settings of regular images, without smoke, blood, low light, occluders, distractors and absent arms."""
+"""Settings of regular images, without smoke, blood, low light, occluders, solid distractors or absent arms."""
 _SETTINGS = json.dumps(asdict(IMAGES))
 CHUNK = 250
 """Number of frames per file."""

@@ -55,8 +55,8 @@ class RealSurface:
     """Surface model of a real frame: instruments in front of a plane parallel to the image.
 
     The world frame is as in synthesis: the plane is z = 0, and the camera is above the origin and looks straight down.
-        The world is scaled to the distance of the synthetic camera, since smoke and the size of drops depend on the
-        distance.
+    The world is scaled to the distance of the synthetic camera, since smoke and the size of drops depend on the
+    distance.
 
     Args:
         scene: scene with one camera.
@@ -173,7 +173,7 @@ class Counterfactual(AlteredSequence):
         return dataclasses.replace(frame, domain=domain, images={self._camera: altered})
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """Mean background, averaged over several times under the condition of the domain."""
+        """Mean background under the condition of the domain, averaged over several points in time."""
         domain, regular = domain or DOMAINS[0], self._sequence.mean_background(camera)
         if domain == DOMAINS[0]:
             return regular
@@ -197,7 +197,7 @@ class Counterfactual(AlteredSequence):
         times = self._sequence.timestamps
         time = index * _FRAME_INTERVAL if times is None else float(times[index] - times[0])
         if domain == "background_change":
-            # The edge is soft, like the edge in an image of a lens.
+            # The edge is soft, as in an image taken through a lens.
             cover = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]
             return np.rint(cover * image + (1.0 - cover) * self._backdrop).astype(np.uint8)
         if domain == "simulated_smoke":

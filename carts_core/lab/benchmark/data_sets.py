@@ -173,7 +173,8 @@ def bench_recording(
     setup = Setup(sequence, sequence.domains[0], cameras, networks, SurfaceSolver(), FreeParameters())
     usable = given or len(bases) == len(sequence.scene.arms)
     joints = _corrected(setup, scored if usable else [], progress)
-    # The positions of the dots are estimated for both kinds of joint positions, from other frames than the scored ones.
+    # The positions of the dots are estimated for both kinds of joint positions, from frames that are not
+    # scored.
     dot_frames = sorted({point.frame for points in others.values() for point in points})
     dot_frames = [dot_frames[index] for index in evenly_spaced(len(dot_frames), min(_DOT_FRAMES, len(dot_frames)))]
     dot_joints = _corrected(setup, dot_frames if usable else [], progress)

@@ -319,7 +319,7 @@ class AlteredSequence(ABC):
 
 
 class AnotherRoom(AlteredSequence):
-    """Real sequence with masks, composited over rooms; its domains are those of the rooms (`Room.domain`).
+    """Sequence with masks, composited over rooms; its domains are those of the rooms (`Room.domain`).
 
     The room is static; light and noise vary between frames and depend on the seed. The mean background is estimated as
     for recordings: the median over frames, excluding pixels covered by the arms at their measured positions.

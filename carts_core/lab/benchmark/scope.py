@@ -57,9 +57,11 @@ class Scope:
     further_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0)
     """Initial errors for the default solver on the other frames of the synthetic sequence [deg]."""
     real_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """Initial errors on real frames in the regular domain, for both methods, relative to the measured joints [deg]."""
+    """Initial errors on real frames in the regular domain, relative to the measured joints, for the default solver and
+    for the paper's setting [deg]."""
     hard_errors_deg: tuple[float, ...] = (2.0,)
-    """Initial errors on synthetic frames with occluders, and for joint optimization of all cameras [deg]."""
+    """Initial errors on synthetic frames with occluders, given masks or other instruments, and for joint optimization
+    of all cameras [deg]."""
     crossing_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Initial errors on synthetic frames with crossing arms, for the default solver and ACS [deg]."""
     consecutive: int = 30
@@ -71,7 +73,7 @@ class Scope:
     calibration_frames: int = 20
     """Number of evenly spaced frames for the calibration of a real sequence."""
     room_frames: int = 2
-    """Number of evenly spaced frames of a real sequence that are composited over each room."""
+    """Number of evenly spaced frames of a sequence that are composited over each room."""
     room_consecutive: int = 8
     """Number of frames corrected together in each room."""
     room_share: int = 1

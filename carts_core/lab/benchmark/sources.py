@@ -41,7 +41,7 @@ class Source:
     """Source of evaluated frames, opened or rendered on demand by `open`."""
 
     name: str
-    """`synthetic`, `real`, or `rooms` and a camera."""
+    """Name as in `Run.source`."""
     description: str
     """Description for the report."""
     camera: str

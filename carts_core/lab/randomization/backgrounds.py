@@ -260,7 +260,7 @@ def _round(rng: np.random.Generator, t: np.ndarray, color: np.ndarray) -> Image:
 
 
 def _distance(points: np.ndarray, width: int, height: int) -> Float[np.ndarray, "h w"]:
-    """Distance of each pixel from the polyline through points [n, 2] [px]; the image size if the line is outside the
+    """Distance of each pixel from the polyline through points [n, 2] [px]; the image width if the line is outside the
     image."""
     away = np.ones((height, width), np.uint8)
     cv2.polylines(away, [np.rint(np.vstack([points, points[-1:]])).astype(np.int32)], False, 0, 1)

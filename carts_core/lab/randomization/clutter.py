@@ -310,7 +310,7 @@ def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray, stro
 
 
 def _streak(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Draw a tapered dark band with soft edges and visible texture, which is a shadow instead of an instrument."""
+    """Draw a tapered dark band with soft edges and visible texture: a shadow, not an instrument."""
     height, width = image.shape[:2]
     start, heading = rng.uniform(-0.1, 1.1, 2) * (width, height), rng.uniform(0, 2 * np.pi)
     length = rng.uniform(0.2, 1.3) * width

@@ -32,7 +32,7 @@ from .shading import GBuffer, photograph, render_gbuffer, shade, tone
 SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 80
-"""Number of images after which an entry of the pool is renewed."""
+"""Number of images after which the next entry of the pool is renewed."""
 _OBSERVATIONS, _SCENES = 0, 1
 """Indices of the random streams."""
 _TRIES = 12
@@ -257,7 +257,7 @@ class PairGenerator:
         )
 
     def _mean_background(self, background: np.ndarray, camera_seed: int) -> np.ndarray:
-        """Mean background BG_m: the scene without arms and camera noise, or sometimes another scene."""
+        """Mean background BG_m, often blurred: the observed scene without arms, or sometimes another scene."""
         rng, appearance = self._observer.rng, self._settings.appearance
         if rng.random() < self._settings.same_background:
             image = photograph(np.random.default_rng(camera_seed), background, appearance)

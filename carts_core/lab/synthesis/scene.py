@@ -99,7 +99,7 @@ def is_instrument(robot: Robot) -> bool:
 
 
 def place_arms(robot: Robot, tip_link: str, camera: Camera) -> tuple[Arm, ...]:
-    """Arms with base frames such that, at zero joint positions, the instruments point at the centre of the scene."""
+    """Arms with base frames such that, at zero joint positions, the instruments point at `WORK_POINTS`."""
     T_world_camera = np.linalg.inv(camera.T_camera_world)
     arms = []
     for name, centre, work in zip(ARM_NAMES, _REMOTE_CENTRES_CAMERA, WORK_POINTS, strict=True):

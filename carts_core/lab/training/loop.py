@@ -223,7 +223,7 @@ class TrainingLoop:
 
     @property
     def planned(self) -> int:
-        """Total number of steps: the given number, or less if the time limit requires it at the current speed."""
+        """Total number of steps: the given number, or fewer if the time limit requires it at the current speed."""
         if self._settings.minutes is None or self.step == 0:
             return self._settings.steps
         seconds = self.history.processor_seconds + self._processor_seconds()

@@ -144,8 +144,9 @@ def train(
 ) -> TrainingResult:
     """Train a network, or resume the run in `output`.
 
-    The run writes `checkpoint.safetensors` periodically, the weights after every validation, and `report/` at the
-    end. If the process is killed, the same call resumes from the last checkpoint.
+    The run writes `checkpoint.safetensors` periodically, the weights after every validation (with `patience`, only
+    after an improvement), and `report/` at the end. If the process is killed, the same call resumes from the last
+    checkpoint.
 
     Raises:
         SettingsError: `output` holds a run with other settings.

@@ -28,7 +28,8 @@ def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
     """Read points from a CSV file with the columns `frame` (its id), `camera`, `arm`, `landmark`, `u` and `v` [px].
 
     Raises:
-        SettingsError: the file cannot be read, lacks a column, or names a missing frame.
+        SettingsError: the file cannot be read, has no points, lacks a column, names a missing frame, or contains a
+            position that is not a finite number.
     """
     try:
         text = read_text(path, TABLE)
@@ -93,7 +94,9 @@ def read_prior(sequence: Sequence) -> HandEyePrior | None:
             f"{path} cannot be read ({error}). Run carts hand-eye again, or remove the file."
         ) from error
     if not fits:
-        raise SettingsError(f"{path} has no covariances of base frames. Run carts hand-eye again, or remove the file.")
+        raise SettingsError(
+            f"{path} has no valid covariances of base frames. Run carts hand-eye again, or remove the file."
+        )
     now = {arm.name: arm.T_world_base for arm in sequence.scene.arms}
     if not all(name in now and np.allclose(now[name], T, atol=1e-6) for name, T in known.items()):
         return None
@@ -154,7 +157,7 @@ STATIONARY_TOLERANCE = 1e-3
 
 
 def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Moving camera -> T_mount_world [m] in the frames of its points.
+    """Moving camera -> T_mount_world [m] in the frames of the points.
 
     Raises:
         SettingsError: a camera has different poses in these frames, or a point names a missing frame.

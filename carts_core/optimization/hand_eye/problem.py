@@ -80,7 +80,7 @@ class View:
     def distances(
         self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"], side: int = 0
     ) -> Float[np.ndarray, "points 2"]:
-        """Distances of the landmarks from their clicked points [px]; the second number is 0 for lines.
+        """Distances in u and v of the landmarks from their clicked points [px]; for lines, the distance and 0.
 
         Args:
             intrinsics: fx, fy, cx, cy [px].
@@ -212,7 +212,7 @@ def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterat
                 np.ascontiguousarray(view.starts[rows]), pixels, K, None, flags=method
             )
         except cv2.error:
-            # Coincident or collinear points have no pose.
+            # Coincident or collinear points do not determine a pose.
             continue
         for rotation, translation in zip(rotations, translations, strict=True):
             T = np.eye(4)
@@ -253,7 +253,7 @@ class HandEyeProblem:
                 for (camera, arm), more in self.missing.items()
             ]
             raise SettingsError(
-                f"{'; '.join(parts)}. Shaft edges are not counted. Click tip and wrist in several frames."
+                f"{'; '.join(parts)}. Points on the shaft are not counted. Click tip and wrist in several frames."
                 if parts
                 else "there are no points. Click tip, wrist and shaft of an arm in 3 to 6 frames."
             )
@@ -287,7 +287,7 @@ class HandEyeProblem:
                 continue
             poses = poses_of(view, self._intrinsics[view.camera], self.settings.pixel_error)
             if known:
-                # Cameras of one endoscope have similar poses, so the first camera's pose is another initial value.
+                # Cameras of one endoscope have similar poses, so the anchor camera's pose is another initial value.
                 beside = self._T_camera_world[self._anchor] @ self._T_world_base[view.arm]
                 poses.append((0.0, beside))
             if not poses:

@@ -107,7 +107,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
 
 
 def _is_ambiguous(views: Sequence[View]) -> bool:
-    """Whether an arm has few points, or points of a single landmark, such as the tip, which moves little."""
+    """Whether an arm has few points, or points of a single landmark, whose positions may differ little."""
     points = [mark.name for view in views for mark in view.landmarks if mark.kind is LandmarkKind.POINT]
     return len(points) < _FEW_POINTS or len(set(points)) == 1
 
@@ -208,7 +208,8 @@ def solve_hand_eye(
         points: three or more points in each of 3 to 6 frames are recommended; an arm needs 4 points in one camera.
 
     Raises:
-        SettingsError: no arm has enough points, all points coincide, or a point names a missing frame or landmark.
+        SettingsError: no arm has enough points, the points do not determine all unknowns, or a point names a missing
+            frame or landmark.
         RobotError: a point or `free_cameras` names an arm or a camera that does not exist.
     """
     settings = settings or HandEyeSettings()

@@ -214,8 +214,8 @@ def _surgpose_points(points: dict) -> dict[str, tuple[float, float]]:
 
 _SUFFIXES = (".png", ".bmp")
 _OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
-"""Suffixes used only in folders without files of the preferred suffixes, since such a folder may contain images and
-masks."""
+"""Suffixes used only if a folder and its subfolders have no files of the preferred suffixes, since a folder with both
+may contain images besides masks."""
 _DEEPEST = 4
 MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
@@ -250,7 +250,7 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
 
 def mask_files(path: Path, *, confined: bool = False) -> list[Path]:
     """Image files below a folder of masks, sorted by frame."""
-    # The folder with links in an export of carts has the finest labels.
+    # In an export of carts, the folder `links` has the finest labels.
     finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
     usable = [file for file in _files(finest) if not (confined and file.is_symlink())]
     return [file for file in usable if file.suffix.lower() in _SUFFIXES] or usable

@@ -35,7 +35,7 @@ class ForeignImage:
     """File name in the source."""
     parts: Callable[[int, int], Iterable[Part]] = lambda height, width: ()
     """Labels and their pixels, decoded on demand, given height and width of the camera's images; later parts cover
-    earlier ones. An empty label marks unlabelled pixels; an image without parts has no mask."""
+    earlier ones. A part with an empty label labels no pixels; an image without parts has no mask."""
     keypoints: Keypoints = field(default_factory=dict)
     """Name -> column and row [px], from the upper left corner of the image."""
     frame: str = ""

@@ -84,7 +84,7 @@ def _chosen(task: Any, what: str, remarks: Counter[str]) -> Any:
     submitted = [each for each in task.get("annotations") or [] if not each.get("was_cancelled")]
     if not submitted:
         if task.get("predictions"):
-            remarks["tasks with predictions only left out; accept them in Label Studio"] += 1
+            remarks["tasks that have only predictions are left out; accept them in Label Studio"] += 1
         return None
     truths = [each for each in submitted if each.get("ground_truth")]
     if len(submitted) > 1:

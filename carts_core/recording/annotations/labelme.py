@@ -19,7 +19,7 @@ from .shapes import check_shapes, check_size, checked_points, corners_of_box, ma
 _POLYGONS = ("polygon", "oriented_rectangle", "rotation", "quadrilateral")
 """Shape types with a list of vertices; the last two are specific to X-AnyLabeling."""
 _UNKNOWN = -1
-"""Width and height of an image whose size X-AnyLabeling does not know."""
+"""Width and height that X-AnyLabeling writes for an image of unknown size."""
 _BOX_TOLERANCE = 1
 """Maximum difference between the size of a stored mask and that of its box, whose last pixel some programs exclude
 [px]."""

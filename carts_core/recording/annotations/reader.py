@@ -32,7 +32,7 @@ def read_annotations(
 ) -> Annotations:
     """Read masks and keypoints for the frames of a sequence.
 
-    Frames are matched by their ids or by the numbers in image names, cameras by their names or by left and right.
+    Frames are matched by their ids or by the last number in image names, cameras by their names or by left and right.
     Annotations of images with distortion are undistorted, unless they were exported by carts.
 
     Args:
@@ -67,7 +67,7 @@ def find_frame(image: str, sequence: Sequence) -> tuple[int, str] | None:
 
 
 class _FrameReader:
-    """Converts images of a source into frames of a sequence."""
+    """Converts annotated images of a source into annotations of the frames of a sequence."""
 
     def __init__(
         self,

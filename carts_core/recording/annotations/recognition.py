@@ -96,7 +96,7 @@ def _labelme_name(content: Any) -> str:
 
 def _read_folder(place: Path, format: AnnotationFormat | None, remarks: Counter[str], confined: bool) -> _Read:
     if format not in (None, *_OF_FOLDERS):
-        raise SequenceError(f"{place} is a folder, but the format {format} is a file. Give the file.")
+        raise SequenceError(f"{place} is a folder, but an export in the format {format} is a file. Give the file.")
     json_files = _json_files(place, confined) if format in (None, "labelme") else []
     samples = [content for file in json_files[:_SAMPLED] if is_labelme(content := _json_or_none(file))]
     text_files = label_files(place, confined=confined) if format in (None, "yolo") else []

@@ -119,7 +119,7 @@ def mask_of_ellipse(
     Args:
         centre: column and row [px].
         radii: along the axes of the ellipse [px].
-        angle: clockwise rotation of its first axis from the columns [rad].
+        angle: clockwise rotation of its first axis from the horizontal axis [rad].
     """
     (x, y), (a, b) = checked_points(centre)[0], checked_points(radii)[0]
     if a <= 0 or b <= 0 or not np.isfinite(angle):

@@ -54,7 +54,7 @@ def label_files(folder: Path, *, confined: bool = False) -> list[Path]:
 
 
 def is_label_file(file: Path) -> bool:
-    """Whether the first line of a text file is a class and an even number of coordinates."""
+    """Whether the first line of a text file is a class and at least four normalized coordinates."""
     try:
         words = next((line.split() for line in read_text(file, LABELS).splitlines() if line.strip()), [])
         return len(words) > _BOX and int(words[0]) >= 0 and all(abs(float(word)) <= _FARTHEST for word in words[1:])
@@ -98,7 +98,7 @@ class _Lines:
         if self._unnamed:
             self._remarks["classes have numbers instead of names, since there is no data.yaml"] += 1
             return f"class {index}"
-        raise ValueError(f"class {index} has no name in data.yaml")
+        raise ValueError(f"class {index} has no name in the file of class names")
 
 
 def _mask(words: Sequence[str], height: int, width: int) -> Bool[np.ndarray, "height width"]:

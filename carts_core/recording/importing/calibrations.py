@@ -48,7 +48,7 @@ class Calibration:
     R: Float[np.ndarray, "3 3"] | None = None
     """Rectification: rotation from the camera's frame to the common frame of the pair."""
     P: Float[np.ndarray, "3 4"] | None = None
-    """Projection of the rectified camera [px]; its last column is -focal length * baseline [px m]."""
+    """Projection of the rectified camera [px]; its last column contains -focal length * baseline [px m]."""
     remarks: tuple[str, ...] = ()
     """Remarks on how the file was interpreted, as sentences."""
 

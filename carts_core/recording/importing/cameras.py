@@ -23,7 +23,8 @@ _SAME_SHAPE = 0.01
 
 
 def side_of(name: str) -> str | None:
-    """Side of a camera, from the name of its topic or folder; None if it contains neither `left` nor `right`."""
+    """Side of a camera, from the name of its topic or folder; None if it contains neither `left` nor `right`, nor a
+    short form such as `l`."""
     words = re.split(r"[^a-z0-9]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower())
     for side in ("left", "right"):
         short = (side, f"{side}s", f"{side}img", f"img{side}", f"camera{side[0]}", f"cam{side[0]}", f"l{side}")
@@ -47,7 +48,7 @@ def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: 
 
 
 def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
-    """Copy of a camera with the calibration given in the options."""
+    """Copy of a camera with the calibration given in the options; unchanged without one."""
     path = job.options.calibration.get(camera.name)
     if path is None:
         if camera.intrinsics is not None:
@@ -194,7 +195,7 @@ class Images:
     pattern: str
     """File name pattern of a frame in the folder; empty for a video."""
     ids: tuple[str, ...]
-    """Ids of the frames: the numbers in the file names, sorted."""
+    """Ids of the frames, sorted: the numbers in the file names, or the frame numbers of a video."""
     size: tuple[int, int]
     """Width and height [px]."""
     times: Float[np.ndarray, " frames"] | None = None

@@ -68,7 +68,7 @@ class ColumnMeanings:
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
     """Determine the meanings of the columns of a table from the user's choices, then from names, then from
-    positions."""
+    numbers in names."""
     others = other_robots(options)
     known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
     for meaning, column in options.columns.items():
@@ -172,7 +172,7 @@ def _words(column: str) -> str:
 def _joints_by_name(
     table: ForeignTable, words: dict[str, str], joints: tuple[Joint, ...], chosen: dict[str, str]
 ) -> dict[str, str]:
-    """Map each joint of a robot other than the PSM to the column of the same name."""
+    """Map each joint of a robot other than the PSM to the column of the same name; finger joints may lack a column."""
     found: dict[str, str] = {}
     for joint in joints:
         own = _words(joint.name)

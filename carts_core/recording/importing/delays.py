@@ -90,7 +90,7 @@ def compensated(
 
 
 def _note(found: TimeOffsetEstimate) -> Note | None:
-    """Note on an estimate; None without motion."""
+    """Note on an estimate; None if nothing was estimated, as without motion or with too few frames."""
     about, option = found.arm, f"--arm-time-offset {found.arm} SECONDS" if found.arm else "--time-offset"
     if found.problem is not None:
         if found.deviation == float("inf"):

@@ -235,7 +235,7 @@ def _numpy(path: Path) -> dict[str, np.ndarray]:
         if values.ndim == 1:
             columns[name] = values
         elif values.ndim >= 2:
-            # Position, velocity and effort of a joint state are concatenated, positions first.
+            # Position, velocity and effort of a joint state are stacked along the second axis, positions first.
             flat = values[:, 0] if values.ndim == 3 else values
             columns.update({f"{name}_{index + 1}": flat[:, index] for index in range(flat.shape[1])})
     return columns

@@ -162,13 +162,13 @@ class FoundCamera:
     distortion: tuple[float, ...] = ()
     """OpenCV's distortion coefficients."""
     T_camera_world: Float[np.ndarray, "4 4"] | None = None
-    """Extrinsics [m]; None if unknown. The world is the frame of the first camera."""
+    """Extrinsics [m]; None if unknown. The world is the frame of the left camera, else of the first camera."""
     rectification: Float[np.ndarray, "3 3"] | None = None
     """R of ROS: rotation from the camera's frame to the common frame of a rectified pair."""
     projection: Float[np.ndarray, "3 4"] | None = None
     """P of ROS [px]; its last column contains the baseline."""
     masks: str = ""
-    """File name pattern of the masks, relative to `images.parent` or absolute; empty without masks."""
+    """Absolute path of the masks, with a pattern of their file names; empty without masks."""
     sparse_masks: bool = False
     sparse_images: bool = False
     """Whether some frames have no image."""
@@ -209,7 +209,7 @@ class FoundRecording:
     """Content of a recording, as found by a source."""
 
     kind: str
-    """Name of the source."""
+    """Kind of the recording as a noun phrase, such as "a ROS bag"."""
     name: str
     cameras: tuple[FoundCamera, ...]
     arms: tuple[FoundArm, ...]

@@ -18,7 +18,7 @@ _UNFINISHED = {
     ".mcap.zstd": "the whole file is compressed. Decompress it with `zstd -d`, and import the result.",
     ".db3.zstd": "it is one file of a bag. Give the folder with its metadata.yaml.",
 }
-"""Suffix of incomplete bags -> remedy."""
+"""Suffix of incomplete, compressed or partial bags -> remedy."""
 
 
 def known_kinds() -> str:
@@ -56,7 +56,8 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
         if name not in source.uses and _is_given(options, name):
             what = name.replace("_", " ")
             problem = (
-                f"the option {what} is not used for {source.label}, since the recording contains this information."
+                f"the option {what} is not used for {source.label}, since this format determines or lacks this "
+                "information."
             )
             remedy = f"Leave out {_option(name)}, or choose another format: --source."
             raise PartError(parts.get(name, "columns"), problem, remedy)

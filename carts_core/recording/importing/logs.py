@@ -203,7 +203,7 @@ class ArmLog:
     names: tuple[str, ...] = ()
     """Names of the joints of a robot other than a PSM; empty for a PSM."""
     si: bool = False
-    """Whether joint positions are converted with the given units and signs."""
+    """Whether joint positions have already been converted with the given units and signs."""
 
     @property
     def T_axes(self) -> Float[np.ndarray, "4 4"]:
@@ -331,7 +331,7 @@ def _inverse_of(poses: Track | None) -> Track | None:
 
 
 def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
-    """Lengths of the instrument: given, estimated from the recording, or of a Large Needle Driver."""
+    """Lengths of the instrument: estimated from the recording, else given, else of a Large Needle Driver."""
     if log.tool:
         job.found(f"tool_type is {log.tool}.", log.name)
     given = job.options.wrist_length
@@ -409,7 +409,7 @@ def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: 
         )
     Ts = transforms(source.values)
     if log.local_poses is None and T_camera_base is not None:
-        # In this case measured_cp is in the camera frame, with the axes of the dVRK.
+        # In this case measured_cp is in the camera frame, with the axes of the log.
         Ts = np.linalg.inv(T_camera_base) @ log.T_axes @ Ts
     found = inverse(Ts, geometry)
     reached = found.reachable
@@ -432,7 +432,8 @@ _MOVES = 5e-4, 0.1
 
 
 def endoscope_motion(poses: Track | None, joints: Track | None, start: float, job: Import) -> Track | None:
-    """Pose of the camera mount over time, in a world with its origin at the first image; None for a static endoscope.
+    """Pose of the camera mount over time, in a world with its origin at the first image; None for a static or
+    unrecorded endoscope.
 
     The camera mount is the ECM's tip, from logged poses or joints; `carts calibrate` estimates the camera's pose
     relative to the mount.

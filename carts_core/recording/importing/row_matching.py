@@ -1,8 +1,9 @@
 """Matching of log rows with images: by times, frame rate, file names, numbers or order.
 
-The methods are, in order of precedence: times, given rates of images and rows, a column with the images' file names or
-    numbers, and the order of rows if the numbers of rows and images are equal. The times of a video only reflect its
-    nominal rate, so one row per image takes precedence over them. A note reports the method and omissions.
+The methods are, in order of precedence: a given column of images, times or given rates of images and rows, a column
+with the images' file names or numbers, and the order of rows if the numbers of rows and images are equal. Without a
+given rate or time offset, one row per image takes precedence over times if the clocks do not overlap, or if the times
+of the images only reflect the nominal rate of a video. A note reports the method and omissions.
 """
 
 import re
@@ -130,7 +131,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
     largest = float(np.max(np.abs(values))) if len(values) else 0.0
     lasts = float(np.ptp(values)) if len(values) else 0.0
     for unit in _LEAST:
-        # A log longer than an hour is relative to its start, in a smaller unit.
+        # A log that would last longer than `_LONGEST` in this unit has relative times in a smaller unit.
         if largest >= _LEAST[unit][0] and lasts * SECONDS[unit] < _LONGEST:
             return unit
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
@@ -279,7 +280,8 @@ def _by_image(
 
 
 def _named(frames: FrameTimes, table: ForeignTable, column: str, job: Import) -> Int[np.ndarray, " rows"] | None:
-    """Index of each row's image, -1 without an image; None if fewer than half of the rows or images are matched."""
+    """Index of each row's image, -1 without an image; None if the matched rows are fewer than half of the rows and
+    fewer than half of the images."""
     by_stem, cells = {stem: index for index, stem in enumerate(frames.stems)}, table.columns[column].tolist()
     exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in cells]
     if max(exact, default=-1) < 0:

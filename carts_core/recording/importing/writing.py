@@ -68,7 +68,7 @@ def check_in_view(arm: FoundArm, camera: FoundCamera, job: Import) -> None:
     if fitting:
         text = f"the base frame from {arm.base_from} puts the tip outside the view of {camera.name}"
         remedy = "Or give the camera axes: --axes." if "the other camera axes" in fitting else ""
-        job.warning(f"{text}; {' or '.join(fitting)} would fit. Correct the file.", arm.name, remedy=remedy)
+        job.warning(f"{text}; {' or '.join(fitting)} would fit. Correct the base frame.", arm.name, remedy=remedy)
 
 
 def _in_view(tips: np.ndarray, T_camera_base: np.ndarray, camera: FoundCamera) -> float:
@@ -105,7 +105,7 @@ MAX_GAP = 0.1
 FOCAL_WIDTHS = 1.2
 """Default focal length, in image widths; a field of view of about 45 degrees."""
 _DISTANCE = 0.12
-"""Default distance from the camera to the tips [m]."""
+"""Minimum default distance from the camera to the tips [m]."""
 _BEHIND = -1.0
 """Default depth of an arm without kinematics: behind the camera, so that it is not visible [m]."""
 

@@ -24,7 +24,8 @@ _JOINTS = ("measured_js", "state_joint_current")
 
 
 def read_endoscope(bag: Bag, start: float, job: Import) -> Track | None:
-    """Motion of the endoscope, from the time of the first image [s]; None for a static endoscope."""
+    """Motion of the endoscope relative to its pose at `start`, the time of the first image [s]; None if it is static or
+    not recorded."""
     topics = [topic for topic, _ in bag.topics if "/suj/" not in topic.casefold()]
     for role, names in (("poses", _POSES), ("joints", _JOINTS)):
         endings = [f"/ecm/{name}" for name in names]
@@ -84,7 +85,7 @@ _PREFERRED = ("rect", "compressed", "")
 
 
 def read_arm_logs(bag: Bag, job: Import) -> list[ArmLog]:
-    """Read the logs of the arms in a bag; notes report joints in another order."""
+    """Read the logs of the arms in a bag; notes report joints in another order or with unknown names."""
     wanted: dict[str, tuple[str, str]] = {}
     names = {recorded.casefold(): name for name, recorded in job.options.arms.items()}
     seen: set[str] = set()
@@ -232,7 +233,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
 
 SOURCE = Source(
     "bag",
-    "ROS 1 or ROS 2 bag",
+    "a ROS 1 or ROS 2 bag",
     "a file .bag or .mcap, or a folder with metadata.yaml",
     lambda path: (path.suffix in BAG_SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file(),
     ("images", "time_offset", "frame_rate"),

@@ -6,7 +6,7 @@ JIGSAWS       TASK/kinematics/AllGestures/TRIAL.txt (76 columns), TASK/video/TRI
 SurgSync      clips: image/{left,right}/I.png, kinematic/PSM1/I.json, camera_calibration/, hand_eye_calibration/
               episodes: video_raw/stereo_{left,right}.mkv, PSM1.parquet, calibration/{left.yaml,hand_eye/}
 CTS           SET/DOMAIN/images_l/I.png, SET/green_screen/{ground_truth_l/I.png, psm1_js.npy, psm2_js.npy}
-AMBF          VIDEO/{images,segmentations}/I.png, VIDEO/kinematics.npy (eight columns per arm, the jaw twice)
+AMBF          VIDEO/{images,segmentations}/I.png, VIDEO/kinematics.npy (eight columns per arm, the last two of the jaw)
 SegSTRONG-C   SUBSET/DOMAIN/{left,right}/I.png, SUBSET/ground_truth/{left,right}/I.png, no kinematics
 """
 
@@ -129,7 +129,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, job: Import) -> FoundC
             T[:3, :3] = Rotation.from_rotvec(values["Extrinsic-Omega"][:3]).as_matrix()
             T[:3, 3] = np.array(values["Extrinsic-T"][:3]) * 1e-3
     except (OSError, ValueError, KeyError) as error:
-        problem = f"{file} has no readable {error}. Copy it again, or choose another calibration."
+        problem = f"{file} has no readable calibration (missing or invalid: {error}). Copy it again, or choose another."
         remedy = f"Use --calibration {camera.name} FILE."
         raise PartError("calibration", problem, remedy, about=camera.name) from error
     job.found(f"calibration from {file.name}.", camera.name)
@@ -237,8 +237,8 @@ def is_packed(path: Path) -> bool:
 
 
 def surgsync_tracks(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
-    """Time series (`Track`) of an arm in a recording of SurgSync: `joints`, `jaw`, `poses` and `local_poses`; None if
-    missing.
+    """Time series (`Track`) of an arm in a recording of SurgSync: `joints`, `jaw`, `poses` and `local_poses`; missing
+    series are None or absent.
 
     Args:
         path: folder of the recording.
@@ -376,7 +376,7 @@ _AMBF_COLUMNS = 8
 _AMBF_FIELD_OF_VIEW = 1.2
 """Vertical field of view of the simulated camera [rad]."""
 _DECIMETRES_FROM = 0.3
-"""Insertion above which the lengths of a simulation are in decimetres [m]."""
+"""Insertion, in the unit of the file, above which the lengths of a simulation are assumed to be in decimetres."""
 
 
 def _ordered(names: Iterable[str]) -> list[str]:
@@ -458,8 +458,8 @@ def _domains(names: list[str]) -> dict[str, str]:
 def _timed(
     arms: list[FoundArm], ids: tuple[str, ...], images: Images, job: Import
 ) -> tuple[tuple[FoundArm, ...], np.ndarray | None]:
-    """Arms with rows at the times of their images, and these times [s]; None for the times without a given frame
-    rate."""
+    """Arms with rows at the times of their images, and these times [s]; None for the times if neither the
+    image names nor a given frame rate determines them."""
     times = frame_times(images, ids, job).times
     rows = np.arange(len(ids), dtype=float)
     found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, job, times)
@@ -467,7 +467,8 @@ def _timed(
 
 
 def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, job: Import) -> FoundArm:
-    """Joint positions of the frames: row n is frame n if no rows are missing, else rows are matched in order."""
+    """Joint positions of the frames: row n belongs to the n-th frame if the counts are equal, else to frame number
+    n."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
         raise SequenceError(f"{file} does not have six finite joint positions per row. Copy it again.")
     numbers = np.array([int(frame) for frame in ids])

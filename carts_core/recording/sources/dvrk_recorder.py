@@ -2,7 +2,7 @@
 
 The time of a frame is the camera's time (mono, else the mean of left and right, else left, else right), else the time
 of reception. Frames are identified by number, never by time. The estimated latency of a sidecar is not applied to these
-times, but proposed as the time offset.
+times; its negative is proposed as the time offset.
 """
 
 from dataclasses import dataclass, replace
@@ -209,7 +209,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
     if offset is None:
         offset = -latency
         if latency:
-            job.guessed(f"time offset: {offset:.4f} s, the recorder's estimated latency.", option="--time-offset")
+            job.guessed(f"time offset: {offset:.4f} s, from the recorder's estimated latency.", option="--time-offset")
     ids = tuple(f"{number:06d}" for number in range(len(times)))
     kind = "a session of the dVRK's recorder"
     return job.recording(kind, path.name, cameras, arms, ids, times, time_offset=offset, motion=motion)

@@ -111,7 +111,8 @@ def _looks_like_calibration(file: Path) -> bool:
 
 
 def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
-    """Find the kinematics table: the given table, a table with an arm, or else a table with many numbers."""
+    """Find the kinematics table: the given table, a table with an arm, or else a table with at least six numeric
+    columns."""
     if options.kinematics == NO_TABLE:
         return None
     if options.kinematics is not None:
@@ -177,7 +178,7 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
 
 
 def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], job: Import) -> FrameTimes:
-    """Frames and their times, from a table with as many rows as images, else from the rate of a video."""
+    """Frames and their times, from a table with as many rows as images, else as in `frame_times`."""
     for file in tables_of(path):
         table = None if file in kinematics else _readable(file)
         if table is None:
@@ -206,7 +207,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
         own = set(each.ids)
         if lacking := [frame for frame in ids if frame not in own]:
             cameras = (*cameras[:place], replace(cameras[place], sparse_images=True), *cameras[place + 1 :])
-            text = f"{len(lacking)} of {len(ids)} frames have no image of this camera, and are kept with the others"
+            text = f"{len(lacking)} of {len(ids)} frames have no image of this camera; they are kept for the others"
             job.warning(f"{text}: {_listing(lacking)}.", name)
         if left_out := [frame for frame in each.ids if frame not in known]:
             text = f"{len(left_out)} of {len(each.ids)} images left out, since another camera has no image of the frame"
@@ -274,7 +275,7 @@ def _matched(
 
 
 def _arms(table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, job: Import) -> tuple[FoundArm, ...]:
-    """Arms with a time for each row; rows without an image are dropped."""
+    """Arms with the time or image index of each row; rows without an image are dropped."""
     arms = []
     for recorded, found in meanings.arms.items():
         known = job.arm_name(recorded)
@@ -288,7 +289,7 @@ def _arms(table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, job: 
 SOURCE = Source(
     "folder",
     "images or videos with a table of kinematics",
-    "a folder with images or videos and a .csv, .parquet, .npy or .npz file, two levels deep",
+    "a folder with images or videos and a .csv, .parquet, .npy or .npz file, at most two levels deep",
     lambda path: path.is_dir() and bool(_image_places(path)) and bool(tables_of(path)),
     ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate", "row_rate"),
     _read,

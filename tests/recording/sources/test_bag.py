@@ -214,7 +214,7 @@ def test_a_calibration_that_a_camera_lacks_gets_a_stand_in(tmp_path):
 
 
 def test_unknown_sources_get_a_list_of_what_was_looked_for(tmp_path):
-    with pytest.raises(CartsError, match=r"(?s)not a recording of a supported format.*\n  bag: ROS 1 or ROS 2 bag"):
+    with pytest.raises(CartsError, match=r"(?s)not a recording of a supported format.*\n  bag: a ROS 1 or ROS 2 bag"):
         find(tmp_path)
     with pytest.raises(CartsError, match="is missing"):
         find(tmp_path / "nothing")

@@ -597,7 +597,7 @@ def test_options_for_unknown_names_list_the_known_ones(tmp_path: Path, options: 
 
 def test_options_that_a_kind_of_recording_does_not_use_are_refused(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", BagKind(cameras=("left",), frames=2))
-    with pytest.raises(CartsError, match=r"kinematics is not used for ROS 1 or ROS 2 bag.*--kinematics"):
+    with pytest.raises(CartsError, match=r"kinematics is not used for a ROS 1 or ROS 2 bag.*--kinematics"):
         find(bag, ImportOptions(kinematics=Path("log.csv")))
     with pytest.raises(CartsError, match="a frame rate is not used, since the images of the bag have times"):
         find(bag, ImportOptions(frame_rate=30))
