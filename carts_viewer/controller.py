@@ -116,7 +116,7 @@ _ENDS_RUN = (
 _COMMON = ("jobs", "solve", "export", "networks", "network", "asked_network", "problems")
 """Fields of the job runner's state that all tabs share."""
 WATCH_INTERVAL = 1.0
-"""Interval between checks of the project file when nothing is edited [s]."""
+"""Interval between checks of the project file [s]."""
 
 
 class Controller(Handler):
@@ -291,7 +291,7 @@ class Controller(Handler):
         self._context.score()
 
     def map(self) -> None:
-        """Compute the maps of the chosen layer; errors are those of `handle`."""
+        """Request maps or refined masks of the chosen layer, except during a stream; errors are those of `handle`."""
         if not self._live.active:
             self._optimizing.map()
 

@@ -1,7 +1,7 @@
 """Edits by several users: drafts, undo steps, and the owners of steps.
 
-A single tab moves freely in the history. With several tabs, undo adds a step that reverts the user's own last step, or
-a step without an owner from before the viewer started; steps of other users stay in effect.
+A single tab moves freely in the history. With several tabs, undo adds a step that reverts the last step that is the
+user's own or has no owner, such as a step from before the viewer started; steps of other users stay in effect.
 """
 
 import time
@@ -50,7 +50,7 @@ class People:
         self._makers: dict[int, Person] = {}
         """Owner by step number, for steps since the viewer started."""
         self._reverted: set[int] = set()
-        """Steps reverted by a later step, and these later steps."""
+        """Steps that undo skips: reverted steps, the steps that revert them, and steps that cannot be reverted."""
 
     def join(self) -> Person:
         """Add a user."""
@@ -91,7 +91,10 @@ class People:
         return bool(person.undone) or self._next_is_free(person)
 
     def undo(self, person: Person) -> Change | None:
-        """Undo the last step that is the user's own or has no owner; None if there is no such step.
+        """Undo the user's last step; None if there is no step to undo.
+
+        With several users, a later step without an owner is undone first. A single user without a step of their own
+        undoes the newest step.
 
         Raises:
             CartsError: a later step has changed the same values.
@@ -158,7 +161,7 @@ class People:
         return next((one for one in self.persons if one.chosen and name.startswith(f"{one.chosen}: ")), None)
 
     def _next_is_free(self, person: Person) -> bool:
-        """Whether the step that was undone last belongs to no other present user."""
+        """Whether the user may redo the next step of the history: it is their own, or no other user is present."""
         state = self.project.state
         if state.position == len(state.steps):
             return False

@@ -128,7 +128,7 @@ class GracefulShutdown:
     """Context in which SIGINT, SIGTERM and SIGHUP end `wait`.
 
     Until `ready`, a signal calls its previous handler or raises `KeyboardInterrupt`; afterwards it only ends `wait`, so
-    that saving is not interrupted. Ignored signals (`nohup`) remain ignored.
+    that saving is not interrupted. Ignored signals (`nohup`) remain ignored, except SIGTERM.
     """
 
     def __init__(self) -> None:

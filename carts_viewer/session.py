@@ -134,7 +134,10 @@ class Session:
         return calibrated_scene(self.scene, self.editor.view).state(frame.measured, None, frame.mounts)
 
     def accepted(self, frame: Frame) -> SceneState | None:
-        """The frame's state at its last acceptance; None if it was never accepted, or in a read-only project."""
+        """The frame's state at its last acceptance.
+
+        None if it was never accepted, or if the project is read-only and the frame is not accepted.
+        """
         view = self.editor.view
         if self._accepted is None or self._accepted[:2] != (view, frame):
             past = view if view.review(frame.index).state is ReviewState.ACCEPTED else None

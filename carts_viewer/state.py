@@ -162,7 +162,7 @@ class Target:
 
     @cached_property
     def given(self) -> GivenMasks | None:
-        """The masks, if they are not those of the recording."""
+        """Imported or painted masks of the target; None without such masks."""
         if self.observed.masks == "recording" or self.project is None or self.recording is None:
             return None
         return project_masks(self.observed.masks, self.project, self.recording)

@@ -124,7 +124,7 @@ class Tab:
     Attributes:
         key: identifier sent by the browser tab; None before a page is attached.
         person: the user.
-        session: the recording and its project, with the state of this tab.
+        session: the recording and its project, with the draft of this tab.
         controller: holds the state and changes it.
         view: widgets and scene of its page; None without a page.
     """
@@ -142,7 +142,7 @@ class Tab:
         self._left_at: float | None = None
         """Time at which the page was closed [s, monotonic]; None while the page is open and after the run was ended."""
         self._gone = False
-        """Whether the page was closed for good, so that scores are not needed."""
+        """Whether the page has been closed for `RECONNECT_TIME`, so that maps and scores are not needed."""
 
     def put(self, intent: Intent) -> None:
         """Queue an intent for the worker. Thread-safe."""

@@ -124,7 +124,7 @@
     if (brush.tool === "keypoint") return [brush.pins ? `${brush.pins} placed · RMS ${brush.residual.toFixed(1)} px` : ""];
     const swatch = (color) => { const one = make("i", { class: "carts-swatch" }); one.style.background = color; return one; };
     const counts = brush.painted.filter(([, count]) => count);
-    const unused = brush.unused ? ["Used only by the solver Surface maps"] : [];
+    const unused = brush.unused ? ["Used only by the Surface maps solvers"] : [];
     return [...unused, ...counts.map(([color, count, name]) => make("span", { class: "carts-key" }, swatch(color), `${count} px ${name}`))];
   }
 

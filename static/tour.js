@@ -21,7 +21,7 @@
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Every edit is saved at once and can be undone."],
     [".carts-review-bar", "Review", "The verdict, and your review of the frame; accepting shows the next unreviewed frame."],
     [".carts-review-bar [data-do=controls]", "All controls", "This button shows all other controls, in tabs: fit, review, values, jobs, export, help."],
-    [".carts-bar [data-do=help]", "More", "This button lists all keys, and changes them. Every control has a hint, shown when the pointer " +
+    [".carts-bar [data-do=help]", "More", "This button lists all keys, which can be changed there. Every control has a hint, shown when the pointer " +
       "rests on it."],
   ];
   let steps = []; // steps whose element is visible, fewer on a small screen

@@ -255,7 +255,7 @@ _MAX_NAMED = 6
 def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
     """Warnings about an export, for frame indices and exported cameras."""
     found: list[str] = []
-    # One hour has 100,000 frames, but few of them have a record.
+    # A recording of one hour has 100,000 frames, but few of them have a record.
     recorded = [index for index in frames if index in project.records]
     accepted = sum(project.review(index).state is ReviewState.ACCEPTED for index in recorded)
     open_ones = len(frames) - accepted

@@ -180,7 +180,7 @@ class BackToMeasured(Intent):
 
 
 class Perturb(Intent):
-    """Offset every joint by `degrees` [deg] or as many millimetres, with random signs determined by `seed`."""
+    """Offset every measured joint by `degrees` [deg] or as many millimetres; `seed` determines the random signs."""
 
     degrees: float
     seed: int
@@ -307,7 +307,10 @@ class ShowLoupe(Intent):
 
 
 class SetTarget(Latest):
-    """Choose the painted layer; None toggles it. If the selected tool does not paint, the brush is selected as well."""
+    """Choose the painted layer; None toggles it.
+
+    If the ignore region is chosen and the selected tool does not paint, the brush is selected as well.
+    """
 
     target: Target | None = None
 
@@ -477,7 +480,7 @@ class OptimizeFrames(Jobs):
 
 
 class Calibrate(Jobs):
-    """Fit base frames, and cameras if they are free, jointly to several frames of the sequence."""
+    """Fit the free calibration parameters, by default the base frames, jointly to several frames of the sequence."""
 
     frames: int = 20
     """Number of frames, spread evenly."""
@@ -601,7 +604,7 @@ class ReviewFrames(Intent):
     """Set the review state of these frames, as one undo step; notes are kept."""
 
     frames: list[int]
-    """Indices of frames; others are ignored."""
+    """Indices of frames; invalid indices are ignored."""
     state: ReviewState
 
 

@@ -176,7 +176,7 @@ class JobsHandler(Handler):
             self._follow(job)
 
     def settle(self) -> None:
-        """End a running job whose work was stopped from another tab."""
+        """End a running job whose work was stopped by an intent, such as `StopSolving`."""
         job = self._running()
         if job is not None and job.kind in ("solve", "export"):
             self._follow(job)

@@ -204,8 +204,8 @@ class Prompting:
     """Turns clicks and boxes into edits of painted layers.
 
     A click adds the object under the pointer. Further clicks refine this object by a point on it or, with `erase`, off
-    it, until the layers are changed otherwise. Any other click with `erase` removes the object under the pointer. A box
-    replaces the content of the layer inside the box by the segmentation.
+    it, until the layers are changed otherwise. A box replaces the content of the layer inside the box by the
+    segmentation. With `erase`, a box or any other click removes the segmented object.
     """
 
     def __init__(self) -> None:

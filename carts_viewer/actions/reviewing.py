@@ -43,7 +43,7 @@ class AnnotatingHandler(Handler):
         self._fitted: SceneState | None = None
         """The pose fitted to the current pins."""
         self._worst: int | None = None
-        """Frame last shown by `ShowWorst`; None after other navigation."""
+        """Frame last shown by `ShowWorst`; None before its first use."""
 
     def released(self) -> None:
         """Handle the release of the pointer."""

@@ -255,7 +255,7 @@ class PropagatingHandler(Handler):
 
 
 def _standard_deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
-    """Arm -> standard deviations of a kept frame's joint positions [rad, m], for arms not posed by hand."""
+    """Arm -> standard deviations of a kept frame's joint positions [rad, m], for arms whose correction has them."""
     known = {arm: value.standard_deviations for arm, value in project.joints(index).items()}
     return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}
 

@@ -200,7 +200,7 @@ class Job:
 
     @property
     def frames(self) -> range | None:
-        """Frames of the job; None for the whole sequence."""
+        """Range of frames of a solve or an export; None for the whole sequence and for other jobs."""
         ends = getattr(self.options, "range", None)
         return None if ends is None else range(ends[0], ends[1] + 1)
 

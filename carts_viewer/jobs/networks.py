@@ -102,7 +102,7 @@ class Networks:
             self._decisions.make(self._weights(_ADAPTED.format(number)), True)
 
     def _resume(self, name: str) -> None:
-        """Use the network that was chosen last, or ask for confirmation."""
+        """Use the network that was chosen last, or ask for confirmation; refused weights are not used."""
         if name not in self.names:
             raise CartsError("it no longer exists")
         accepted = self._decisions.find(self._weights(name))

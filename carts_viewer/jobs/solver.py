@@ -68,7 +68,7 @@ class FrameTask:
     free: FreeParameters
     target: Target
     ignore: Masks
-    """Camera -> pixels that show an occluder, for all cameras."""
+    """Camera -> ignored pixels, for all cameras of the scene that have such pixels."""
     shown: bool = False
     """Whether the run is displayed: the domain of the network is checked first, and the result is assessed."""
 
@@ -98,7 +98,7 @@ class CalibrationTask:
     free: FreeParameters
     target: Target
     ignore: tuple[Masks, ...] | None = None
-    """Per frame, pixels that show an occluder."""
+    """Per frame, camera -> ignored pixels; None for no ignored pixels."""
     backgrounds: bool = True
     """Whether the mean background of the recording is used."""
     known_base_frames: Mapping[str, Float[np.ndarray, "6 6"]] = field(default_factory=dict)
@@ -174,7 +174,7 @@ class Fit:
     loss: float
     """Mean loss of the cameras with an arm in view [1]."""
     dice: float | None = None
-    """Dice overlap with the ground-truth mask; None if there is none."""
+    """Lowest Dice overlap with a ground-truth mask over all cameras; None without such a mask."""
 
 
 @dataclass(frozen=True)

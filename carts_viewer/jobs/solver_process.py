@@ -36,7 +36,7 @@ _NICENESS = 5
 _LENGTH = 8
 """Length of the number before each request [bytes]."""
 _MAX_FAILURES = 3
-"""Number of consecutive processes that end without a reply, after which it is started only by a request."""
+"""Number of consecutive processes that end without a reply, after which only a request starts the next process."""
 _MEMORY_KEPT = 10.0
 """Idle time after which freed memory is returned to the operating system [s]."""
 _IMPORTED_LATER = ("pytorch_kinematics", "roma")
@@ -126,7 +126,7 @@ class Listener(Protocol):
         """The solver prepares something; `text` is for the user."""
 
     def solver_stopped(self, error: SolverStopped) -> None:
-        """The process has ended unexpectedly; its requests fail with this error, and it was started again."""
+        """The process has ended unexpectedly; its requests fail with this error. For restarts, see `_MAX_FAILURES`."""
 
 
 class Requests(Protocol):
@@ -144,7 +144,7 @@ class Requests(Protocol):
         ...
 
     def start(self, *warm_up: Any) -> None:
-        """Prepare for requests; `warm_up` is the first one."""
+        """Prepare for requests; the request `warm_up` is carried out after every restart."""
 
     def ask(self, *request: Any) -> Reply[Any]:
         """Request of `_Desk.answer`."""
@@ -360,7 +360,7 @@ class SolverProcess:
 
 
 def _started(pipe: Connection, urgent: bool) -> "subprocess.Popen[bytes] | None":
-    """The process, with low priority after the first request if `urgent`; None if the system cannot start it."""
+    """The process, with low priority (if `urgent`, only after its first request); None if it cannot be started."""
     paths = [os.path.abspath(path) for path in sys.path]
     start = "import sys; sys.path[:] = sys.argv[4:]; from carts_viewer.jobs.solver_process import serve; serve()"
     try:

@@ -87,7 +87,10 @@ def optimize_frames(
 
 
 def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Generator[Progress | Waiting]:
-    """Fit base frames, and cameras if they are free, to frames spread over the sequence; one undo step."""
+    """Fit the free calibration parameters, by default the base frames, to frames spread over the sequence.
+
+    The result is one undo step.
+    """
     session, state = context.session, context.state
     sequence = session.sequence
     cameras = [camera.name for camera in session.scene.cameras]

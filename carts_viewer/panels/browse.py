@@ -123,7 +123,7 @@ _CALENDAR = 1e8
 
 
 def _time(stamp: float, began: float) -> str:
-    """Time of a frame relative to the first frame, and its date if known, as HTML."""
+    """Timestamp of a frame, as HTML; a time since 1970 is shown relative to the first frame, with its date as hint."""
     if stamp < _CALENDAR:
         return f"{stamp:.3f} s"
     date = f"{datetime.fromtimestamp(stamp, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -51,8 +51,10 @@ class FramesData:
 
 
 def _pose_numbers(project: ProjectState) -> dict[int, int]:
-    """Numbers in the addresses of thumbnails, which change with the poses of frames with a record, and of all others
-    (`WHOLE_PROJECT`)."""
+    """Frame -> number in the address of its thumbnail, which changes with the pose, for frames with a record.
+
+    `WHOLE_PROJECT` -> the number of all other frames.
+    """
     whole = id(project.records.get(WHOLE_PROJECT))
     found = {index: (id(record) ^ whole) % _NUMBERS for index, record in project.records.items() if index >= 0}
     return {**found, WHOLE_PROJECT: whole % _NUMBERS}

@@ -59,7 +59,7 @@ HINTS = {
     "Note": "Note on this frame; saved when you leave the field",
     "Previous worst": "Show the previous frame, in the order from worst to best ({ShowWorst -1})",
     "Next worst": "Show the next frame, in the order from worst to best, that is neither accepted nor rejected; frames "
-    "without a verdict come last ({ShowWorst 1})",
+    "of unknown fit come last ({ShowWorst 1})",
     "Next unreviewed": "Show the next frame without a review ({ShowUnreviewed 1})",
     "Solve between": "Fit all frames between the nearest kept frames together; kept frames (accepted, moved by "
     "hand, or keyframes) do not change ({Solve False})",
@@ -84,11 +84,11 @@ HINTS = {
     "Discard jobs": "Cancel these jobs without running them",
     "Accept network": "Use these weights now and in the future",
     "Refuse network": "Do not use these weights",
-    "Which frames": "Frames of the job",
+    "Which frames": "Frames to optimize individually",
     "Optimize individually": "Run on each of these frames separately, from its current pose; worse results are "
     "discarded. Solve all (Review) fits neighbouring frames together",
-    "Calibrate": "Fit base frames, or the parameters ticked under Free parameters, jointly to these frames. All masks "
-    "change, so accepted frames become unreviewed; one undo step",
+    "Calibrate": "Fit base frames, or the parameters ticked under Free parameters, jointly to evenly spaced frames. "
+    "All masks change, so accepted frames become unreviewed; one undo step",
     "Job": "Job to which the buttons and the log below refer",
     "Cancel": "Stop this job, or remove it from the queue; saved results are kept",
     "Start again": "Queue this job again; a job on many frames continues where it stopped",
@@ -102,7 +102,7 @@ HINTS = {
     "Only the range": "Export only frames in the timeline's range",
     "Category per": "Kind of object that gets its own category",
     "Copy images": "Copy the images beside their labels; otherwise labels refer to the recording's images",
-    "Export": "Write the frames to a new folder beside the project, as a job",
+    "Export": "Write the frames to a new file or folder beside the project, as a job",
     "Cancel export": "Cancel the export and remove its files",
     "Download": "Send the last export to this browser",
     "Export mask": "Download this frame's mask of the shown camera as PNG (255 is arm), refined if the layer "

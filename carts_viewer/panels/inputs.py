@@ -91,7 +91,7 @@ def valid(handle: Any, value: Any) -> bool:
 
 
 def write(handle: Any, value: Any) -> None:
-    """Set a widget's value if it differs; a non-finite number counts as different."""
+    """Set a widget's value if it differs; NaN always counts as different."""
     if handle.value != value:
         handle.value = value
 

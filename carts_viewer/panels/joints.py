@@ -140,7 +140,7 @@ _COLUMNS = {
     "Change": f"Correction of the measured value. More than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm is rare.",
     "Run": "Change by the last run",
     "±": "One standard deviation",
-    "Image": "Whether the image determines the joint. The mask hardly depends on a joint that it does not determine.",
+    "Image": "Whether the image determines the joint; the mask hardly depends on an undetermined joint.",
     "Error": "Difference from the ground truth",
 }
 """Columns of the table, with their hints."""

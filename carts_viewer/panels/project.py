@@ -115,7 +115,7 @@ class PeoplePanel:
 
 
 class MessagePanel:
-    """The newest error, over the image, until it is dismissed or another action succeeds."""
+    """The newest error, over the image, until it is dismissed or an action such as showing another frame clears it."""
 
     def __init__(self, page: PanelPage) -> None:
         self._page = page

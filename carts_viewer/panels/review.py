@@ -48,7 +48,7 @@ class ReviewPanel:
             page.row(accept, keep, weights=(3, 2))
             work = page.button("Needs work", intents.SetReview(ReviewState.NEEDS_WORK))
             reject = page.button("Reject", intents.SetReview(ReviewState.REJECTED))
-            hint = "Clear the review of this frame (Shift+G)"
+            hint = "Clear the review of this frame ({SetReview untouched})"
             clear = page.button("Clear", intents.SetReview(ReviewState.UNTOUCHED), hint=hint)
             page.row(work, reject, clear, weights=(11, 7.65, 7.35))
             self._note = gui.add_text("Note", "")
@@ -83,7 +83,7 @@ class ReviewPanel:
             self._count(state.project)
 
     def _count(self, project: ProjectState) -> None:
-        # One hour has 100,000 frames, but few of them have a record.
+        # A recording of one hour has 100,000 frames, but few of them have a record.
         recorded = project.records.keys() - {WHOLE_PROJECT}
         counts = Counter(review_name(project, index) for index in recorded)
         counts[str(ReviewState.UNTOUCHED)] += len(project.identity.frame_ids) - len(recorded)

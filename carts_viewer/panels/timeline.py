@@ -83,8 +83,9 @@ class Traces:
         """A curve from frame `first` up to but excluding `last`; None if there is no such curve.
 
         Returns:
-            `edges`: first frame of each column, and the end of the last column; `curves`: minimum and maximum of each
-            column, null if there is no value, for measured (or estimated) and, for joints, corrected values.
+            `edges`: first frame of each column, and the end of the last column; `curves`: minima and maxima of
+            the columns, null without a value; one entry for a figure, two for the measured and the corrected values of
+            a joint.
         """
         first, last = max(first, 0), min(last, self._figures.shape[1])
         values = self._values(name)

@@ -14,7 +14,7 @@ from carts_viewer.transport.page import TabPage
 
 
 class ToolPalette:
-    """Sends the selected tool, its options and the painted pixels to the page when they have changed."""
+    """Sends the selected tool, its options and the numbers of painted pixels to the page when they have changed."""
 
     def __init__(self, page: TabPage, session: Session) -> None:
         self._page, self._scene = page, session.scene

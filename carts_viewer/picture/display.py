@@ -82,7 +82,10 @@ class PageDisplay:
         self._shown = state
 
     def show_scene(self, on: bool) -> None:
-        """Update the arms and cameras of the 3D view with each picture; their first poses determine its viewpoint."""
+        """Set whether each picture updates the arms and cameras of the 3D view.
+
+        The first picture always does, since the first poses determine the viewpoint.
+        """
         self._scene_shown = on
         if on and self._shown is not None:
             self._show_scene(self._shown)
@@ -120,7 +123,7 @@ class PageDisplay:
             if compare.share > 0.0:
                 overlay = composed(overlay, self._layer(state, camera, poses[compare.left]), compare.share)
         if compare.mode is not CompareMode.PAINTED:
-            # An outline is not the layer of a corrected mask.
+            # A comparison of poses shows corrections of the mask only while a painting tool is selected.
             shown = correction if compare.mode is None or state.brush.tool.paints else None
             _draw_paint(overlay, state, shown, state.ignore_region_of(camera))
         return overlay
@@ -189,7 +192,7 @@ def _picture(state: ViewState) -> tuple:
 def _draw_paint(
     overlay: Rgba, state: ViewState, corrected: MaskCorrection | None, ignored: IgnoreRegion | None
 ) -> None:
-    """Draw painted layers, unless only the frame is shown."""
+    """Draw painted layers, unless only the frame is shown and no painting tool is selected."""
     at_work = state.brush.tool.paints
     if at_work or state.layer is not Layer.NONE:
         # The layers of ground truth and parts show the corrected mask itself.

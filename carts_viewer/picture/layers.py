@@ -191,7 +191,7 @@ def _hatch(height: int, width: int) -> Bool[np.ndarray, "height width"]:
 
 
 def _palette(arm_ids: ArmIds) -> tuple[UInt8[np.ndarray, "arms_and_1 4"], int]:
-    """RGBA of background (index 0) and of each arm (its index + 1), and the number of visible arms."""
+    """RGBA of background (index 0) and of each arm (its index + 1) up to the last visible arm, and their number."""
     count = int(arm_ids.max(initial=-1)) + 1
     # The browser interpolates colour and opacity separately, so a black background would leave a dark seam.
     rows = [(*ARM_COLORS[0], 0), *((*ARM_COLORS[arm % len(ARM_COLORS)], 255) for arm in range(count))]

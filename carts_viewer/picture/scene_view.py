@@ -216,7 +216,7 @@ class SceneView:
         return links
 
     def _add_grid(self) -> None:
-        """A grid of centimetres behind the arms, perpendicular to the optical axis of the shown camera."""
+        """A grid of centimetres below the arms, parallel to the optical axis and the x axis of the shown camera."""
         self._shown.add_grid(
             GRID,
             width=20 * _GRID_CELL,

@@ -58,7 +58,8 @@ class Roots:
         """Check an absolute path below one of the folders.
 
         Raises:
-            SettingsError: the path is outside of the folders, does not exist, or contains a link or a hidden folder.
+            SettingsError: the path is outside of the folders, does not exist, contains a link or a hidden name, or is
+                neither a folder nor a file.
         """
         path = Path(text)
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)

@@ -33,7 +33,7 @@ class Listing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Chunk of the list of files."""
 
     files: list[tuple[Annotated[str, msgspec.Meta(max_length=4096)], Annotated[int, msgspec.Meta(ge=0, le=MAX_BYTES)]]]
-    """Path relative to the dropped folder, and size [bytes]."""
+    """Path, which begins with the name of a dropped folder, and size [bytes]."""
     more: bool = False
     """Whether another chunk follows."""
 
@@ -83,7 +83,7 @@ def _check(root: Path, listed: list[tuple[tuple[str, ...], int]]) -> None:
     if not 0 < len(listed) <= MAX_FILES:
         raise SettingsError(f"the upload has {len(listed)} files; 1 to {MAX_FILES:,} are allowed.")
     if deep := next((names for names, _ in listed if len(names) > _MAX_DEPTH), None):
-        raise SettingsError(f"{'/'.join(deep)} is more than {_MAX_DEPTH} folders deep. Drop the inner folder.")
+        raise SettingsError(f"{'/'.join(deep)} is more than {_MAX_DEPTH} levels deep. Drop the inner folder.")
     total, free = sum(size for _, size in listed), shutil.disk_usage(root).free - KEPT_FREE
     if total > min(MAX_BYTES, free):
         raise SettingsError(

@@ -110,8 +110,8 @@ class Guard:
         own = len(hosts) == 1 and self._is_ours(_hostname(hosts[0]))
         if not own and (len(hosts) != 1 or hosts[0] not in self._proxy_hosts):
             return (
-                f"Requests for {', '.join(hosts)!r} are refused. Use the viewer's own address, or give the "
-                "proxy's: --trusted-origin."
+                f"Requests for {', '.join(hosts)!r} are refused. Use the viewer's own address, or allow the address of "
+                "a proxy with --trusted-origin."
             )
         trusted = {*self.proxy.trusted_origins, *([f"http://{hosts[0]}"] if own else [])}
         for origin in headers.get_all("Origin"):

@@ -150,7 +150,7 @@ class CalibrationReport:
     after: tuple[float | None, ...]
     """Final residuals of the points [px]."""
     disagreeing: tuple[int, ...]
-    """Indices of points whose residual has grown beyond the noise of clicks."""
+    """Indices of points whose residual has grown beyond the errors of clicks and measured joints."""
     objection: str
     """Description of the contradiction between points and calibration; empty if they agree."""
     rms_limit: float | None = None
@@ -188,13 +188,13 @@ def _objection(result: Calibrated, compared: PointAgreement, clicking: Clicking,
         point = points[worst]
         name = f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
         return (
-            f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than click "
-            f"noise explains: the {name} from {before[worst]:.1f} to {after[worst]:.1f} px, "
+            f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than errors "
+            f"of clicks and joints explain; the worst is the {name}: {before[worst]:.1f} to {after[worst]:.1f} px, "
             f"with {limits[worst]:.1f} px allowed."
         )
     if not compared.agrees:
         return (
-            "All points together moved farther from the clicks than click noise explains: RMS "
+            "All points together moved farther from the clicks than errors of clicks and joints explain: RMS "
             f"{compared.rms_before:.1f} to {compared.rms_after:.1f} px, with {compared.rms_limit:.1f} px allowed."
         )
     return result.beyond[:1].upper() + result.beyond[1:]
@@ -261,7 +261,7 @@ def calibrated_recording(
 def target_folder(roots: Roots, source: Path, name: str) -> Path:
     """Folder for the sequence of a recording: beside the recording, or inside it if it is an allowed folder."""
     if (fault := name_fault(name)) is not None:
-        raise SettingsError(f"the name {name!r} cannot be used, {fault}. Choose another name.")
+        raise SettingsError(f"the name is {name!r}, {fault}. Choose another name.")
     parent = source.parent if source not in roots.folders else source
     folder = roots.checked(parent) / f"{name}_sequence"
     number = 2

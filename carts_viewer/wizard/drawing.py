@@ -12,11 +12,11 @@ from carts_core.model.scene import Arm
 WIDTH, HEIGHT = 640, 256
 """Size of the drawing [px]."""
 _BEND = 0.6
-"""Position of revolute joints, as a share of their range [1]; the joints of a wrist are slightly bent."""
+"""Position of every joint, as a share of its range [1]; the joints of a wrist are thus slightly bent."""
 _OBLIQUE = np.radians(30.0)
 """Rotation of the view about the shaft [rad], so that both jaws are visible."""
 _MARGIN = 0.2
-"""Margin around the landmarks, as a share of the width [1]."""
+"""Margin around the landmarks, as a share of width and height [1]."""
 _TOLERANCE = 0.7
 """Maximum distance of the outline from the silhouette [px]."""
 

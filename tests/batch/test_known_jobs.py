@@ -185,7 +185,7 @@ def test_the_page_lists_a_hundred_jobs_at_a_time_and_finds_the_others(tmp_path: 
     page.choose("find", "CASE22")
     assert host.listed() == names[220:230]
     page.choose("find", "<b>" * 100)
-    assert host.listed() == [] and "No job has this name." in host.sent[-1] and "<b><b>" not in host.sent[-1]
+    assert host.listed() == [] and "No job name contains this text." in host.sent[-1] and "<b><b>" not in host.sent[-1]
     page.close()
 
 

@@ -61,7 +61,7 @@ def test_no_name_leaves_the_folder(tmp_path: Path, path: str) -> None:
         ([], "has 0 files"),
         ([("a/B", 1), ("a/b", 1)], "two files are named"),
         ([("a", uploads.MAX_BYTES), ("b", uploads.MAX_BYTES)], "GB are allowed"),
-        ([("/".join("abcdefghi"), 1)], "folders deep"),
+        ([("/".join("abcdefghi"), 1)], "levels deep"),
     ],
 )
 def test_uploads_beyond_the_limits_are_refused(tmp_path: Path, files: list[tuple[str, int]], message: str) -> None:
