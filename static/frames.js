@@ -105,7 +105,7 @@
     const action = target.closest("[data-do]")?.dataset.do;
     if (sort) order = { by: sort, down: order.by === sort && !order.down };
     else if (action === "view") { gallery = !gallery; localStorage.setItem("carts-frames", gallery ? "gallery" : "table"); }
-    else if (action === "all") { const all = found(); chosen = new Set(chosen.size === all.length ? [] : all.map((one) => one.index)); }
+    else if (action === "all") { const all = found(); chosen = new Set(all.every((one) => chosen.has(one.index)) ? [] : all.map((one) => one.index)); }
     else if (action) window.carts.report("ReviewFrames", { frames: [...chosen], state: REVIEWS[action] });
     else if (row && event.detail === 2) { open(Number(row.dataset.row)); return; } // the first click drew a new row
     else if (row) choose(Number(row.dataset.row), event);

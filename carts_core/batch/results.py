@@ -109,9 +109,10 @@ def review_project(folder: OutputPath, job: Job) -> Path:
         raise CartsError(f"results of {job.name} cannot be read ({error}). Run the job again.") from error
     path = (folder / f"review-{digest[:12]}.carts").path
     if not path.exists():
-        project = Project.open(sequence := Sequence.open(sequence_file(folder, job)), path)
+        sequence = Sequence.open(sequence_file(folder, job))
+        edits = {key: value for table in tables for key, value in _edits(sequence, table)}
+        project = Project.open(sequence, path)
         try:
-            edits = {key: value for table in tables for key, value in _edits(sequence, table)}
             project.apply(f"Results of {job.name}", edits)
         finally:
             project.close()

@@ -76,9 +76,9 @@ class Batch(RangedOptions):
         with message_if_stopped(f"{folder} holds the finished jobs; rerun the command to resume"):
             if not self.report_only:
                 failed = self._run(console, chosen, folder)
-            if len(chosen) == len(jobs):
+            if self.report_only or len(chosen) == len(jobs):
                 console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
-        if len(chosen) < len(jobs):
+        if not self.report_only and len(chosen) < len(jobs):
             console.print("this shard is done; after the last shard, write the report with --report-only")
         console.print(f"to inspect the results: carts view {folder}{_roots(jobs, folder.path)}")
         if failed:

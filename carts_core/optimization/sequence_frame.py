@@ -101,10 +101,11 @@ def _checkpointed(
             return compute()
         images = [(name, frame.images[name]) for name in sorted(frame.images)]
         measured = [(name, frame.measured[name]) for name in sorted(frame.measured)]
-        masks = sorted((frame.masks or {}).items())
+        masks, mounts = sorted((frame.masks or {}).items()), sorted(frame.mounts.items())
+        hidden = sorted(frame.ignoring(self._ignore(frame.index)).items())
         given = [value for value in (*arguments, *options.values()) if not callable(value)]
         plain = [astuple(value) if isinstance(value, Gaussian) else value for value in given]
-        key = fingerprint(method.__name__, frame.index, images, masks, measured, plain)
+        key = fingerprint(method.__name__, frame.index, images, masks, measured, mounts, hidden, plain)
         return self._checkpoint.value(key, compute)
 
     return looked_up

@@ -221,7 +221,7 @@ class PropagatingHandler(Handler):
             return "Stopped before the first frame was solved"
         if figures:
             first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
-            self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
+            self._session.editor.apply(f"Solve {counted(len(figures), 'frame')}, {first} to {last}", edits, figures)
             self._context.refresh()
         solved = f"{counted(len(figures), 'frame')} solved, one undo step"
         text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
@@ -240,7 +240,7 @@ class PropagatingHandler(Handler):
             edits.update(outcome.edits)
             del self._held[index]
         figures = {index: outcome.figures for index, outcome in taken.items()}
-        self._session.editor.apply(f"Take {len(taken)} solved poses", edits, figures)
+        self._session.editor.apply(f"Take {counted(len(taken), 'solved pose')}", edits, figures)
         listed = self._context.state.solve.listed if self._context.state.solve else ()
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()

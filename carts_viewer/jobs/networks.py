@@ -53,7 +53,9 @@ class Networks:
             if remembered != STARTED and not optimizers.given_surface():
                 self._resume(remembered)
         except (OSError, CartsError) as error:
-            self.problem = f"The network {remembered!r}, which was selected last, cannot be used: {error}."
+            self.problem = (
+                f"The network {remembered!r}, which was selected last, cannot be used: {str(error).rstrip('.')}."
+            )
 
     def update_names(self) -> None:
         """Update `names` from the folders beside the project."""

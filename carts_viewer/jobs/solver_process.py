@@ -381,13 +381,13 @@ def _packed(number: int, request: tuple[Any, ...]) -> bytes:
 
 def _description(status: int, failures: int) -> str:
     """Message about the unexpected end of the process with an exit status."""
-    reason = f"exit status {status}" if status else "see the log"
+    reason = f"exit status {status}"
     if status < 0:
         reason = signal.Signals(-status).name
         if -status == signal.SIGKILL:
             reason += ", for example because memory ran out"
     if failures >= _MAX_FAILURES:
-        return f"The solver process cannot be started ({reason}). See the terminal, and try again."
+        return f"The solver process cannot be started ({reason}). Read the terminal, and try again."
     return (
         f"The solver process ended unexpectedly ({reason}) and was started again. Edits and saved results are kept; "
         "start the interrupted work again."

@@ -28,6 +28,7 @@ from carts_core.project.values import WHOLE_PROJECT
 from carts_core.recording import evenly_spaced
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_core.stopping import PARENT
+from carts_core.wording import counted
 from carts_viewer.actions.context import Context
 from carts_viewer.jobs.comparison import Comparison, Waiting
 from carts_viewer.jobs.optimizers import OptimizerFactory, provenance
@@ -82,7 +83,7 @@ def optimize_frames(
         context.refresh()
         taken += 1
         yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: {fit.verdict.verdict}, loss {fit.loss:.3g}")
-    text = f"{taken} frames optimized" + (f", {worse} discarded because they were worse" if worse else "")
+    text = f"{counted(taken, 'frame')} optimized" + (f", {worse} discarded because they were worse" if worse else "")
     yield Progress(len(frames), len(frames), text)
 
 

@@ -118,7 +118,7 @@ def legend(state: ViewState, poses: Mapping[ComparedPose, SceneState | None]) ->
                 "dash": [LINES[which].dash, LINES[which].gap],
             }
             for which in ComparedPose
-            if which in poses
+            if which in poses and which in LINES
         ]
     correction = state.mask_correction
     if state.compare.mode is not CompareMode.PAINTED:

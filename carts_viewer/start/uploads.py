@@ -86,9 +86,10 @@ def _check(root: Path, listed: list[tuple[tuple[str, ...], int]]) -> None:
         raise SettingsError(f"{'/'.join(deep)} is more than {_MAX_DEPTH} levels deep. Drop the inner folder.")
     total, free = sum(size for _, size in listed), shutil.disk_usage(root).free - KEPT_FREE
     if total > min(MAX_BYTES, free):
+        why = f" ({root} must keep 1 GB free)" if free < MAX_BYTES else ""
         raise SettingsError(
-            f"the upload has {total / 1e9:.1f} GB; at most {max(min(MAX_BYTES, free), 0) / 1e9:.1f} GB are allowed "
-            f"({root} must keep 1 GB free). Copy it to the computer of the viewer instead."
+            f"the upload has {total / 1e9:.1f} GB; at most {max(min(MAX_BYTES, free), 0) / 1e9:.1f} GB are allowed{why}."
+            " Copy it to the computer of the viewer instead."
         )
     seen: dict[str, tuple[str, ...]] = {}
     for names, _ in listed:

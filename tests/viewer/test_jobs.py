@@ -21,6 +21,7 @@ from carts_core.networks.weights import read_weights, save_weights
 from carts_core.project import ReviewState, Source
 from carts_core.project.identity import data_dir
 from carts_core.resources import shipped_weights
+from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.jobs import work
 from carts_viewer.jobs.companions import Decisions
@@ -58,7 +59,7 @@ def test_what_takes_long_waits_for_what_runs_and_the_page_stays_usable(desk: Des
     assert (optimized.done, optimized.total) == (3, 3) and len(optimized.log) >= 5
     assert desk.state.export is not None and str(desk.state.export.path) in exported.text
     taken = [desk.saved.joints(index)["PSM1"].provenance.source for index in range(3) if desk.saved.joints(index)]
-    assert f"{len(taken)} frames optimized" in optimized.text and set(taken) <= {Source.OPTIMIZER}
+    assert f"{counted(len(taken), 'frame')} optimized" in optimized.text and set(taken) <= {Source.OPTIMIZER}
     # Each is a step of its own, with a verdict.
     assert all(desk.saved.verdict(index) is not None for index in range(3) if desk.saved.joints(index))
 
