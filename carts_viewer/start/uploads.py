@@ -88,8 +88,8 @@ def _check(root: Path, listed: list[tuple[tuple[str, ...], int]]) -> None:
     if total > min(MAX_BYTES, free):
         why = f" ({root} must keep 1 GB free)" if free < MAX_BYTES else ""
         raise SettingsError(
-            f"the upload has {total / 1e9:.1f} GB; at most {max(min(MAX_BYTES, free), 0) / 1e9:.1f} GB are allowed{why}."
-            " Copy it to the computer of the viewer instead."
+            f"the upload has {total / 1e9:.1f} GB; at most {max(min(MAX_BYTES, free), 0) / 1e9:.1f} GB are allowed"
+            f"{why}. Copy it to the computer of the viewer instead."
         )
     seen: dict[str, tuple[str, ...]] = {}
     for names, _ in listed:
