@@ -13,7 +13,7 @@ LOCAL_NOTEBOOKS = ("http://localhost:8888", "http://127.0.0.1:8888")
 
 
 class NotebookView:
-    """A viewer that runs in this process and is displayed as a frame; close it to save the corrections.
+    """A viewer that runs in this process and is displayed in an inline frame; close it to save the corrections.
 
     Attributes:
         app: the viewer.

@@ -218,7 +218,7 @@ class Alignment:
 
 
 class RegionImages:
-    """Images of a frame at the size at which lines are drawn, without other preparation.
+    """Images of a frame, resized for the correspondence lines, without other preparation.
 
     Args:
         ignore: camera name -> pixels that show an occluder.

@@ -176,7 +176,7 @@ class Iterate:
     """Iteration number; 0 for the start."""
     state: SceneState
     loss: float
-    """Loss without the prior; comparable within one observation and, if not `live`, one blur."""
+    """Loss without the prior; comparable within one observation and, unless `FrameOptimizer` is `live`, one blur."""
     gradient_norms: dict[str, float]
     """Absolute derivative of the objective with respect to each unknown, per radian-like unit."""
     seconds: float

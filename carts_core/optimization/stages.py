@@ -196,8 +196,8 @@ def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], 
     """Whether the start fits the edges and an observation conditioned on it as well as the estimate does.
 
     If the two silhouettes differ strongly, the result is False without an observation. If True, the new observation
-    replaces the observation of the problem. Always False if a calibration is free, since its start is expected to be
-    wrong.
+    replaces the observation of the problem. Always False if calibration parameters are free, since their
+    start is expected to be wrong.
     """
     if problem.variables.moves_calibration:
         return False

@@ -106,7 +106,7 @@ class FreeParameters:
     joints: bool = True
     """Joint positions of the free arms."""
     base_frames: bool = False
-    """Base frames of the free arms (hand-eye error as seen from the arm)."""
+    """Base frames of the free arms (one hand-eye error per arm)."""
     extrinsics: bool = False
     """Camera extrinsics."""
     intrinsics: bool = False

@@ -138,7 +138,7 @@ class AlignRegions(Ranged):
 
 @dataclass(frozen=True)
 class PreferStart(Ranged):
-    """Return to the start if it explains the image as well as the estimate; skipped if a calibration is free."""
+    """Return to the start if it explains the image equally well; skipped if calibration parameters are free."""
 
     improvement: Annotated[float, Range(0, 1e6, above=True)] = 5.0
     """Minimum improvement of the objective for which the estimate is kept [1]."""

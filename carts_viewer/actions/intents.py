@@ -551,7 +551,7 @@ class Export(Exporting):
     shown_camera: bool = False
     """Whether to export only the shown camera."""
     range: tuple[int, int] | None = None
-    """First and last exported frame; None for the whole sequence."""
+    """First and last frame of the range to which the export is limited; None for the whole sequence."""
     masks: Masks = "auto"
     """Which masks are refined, if the format allows it."""
 

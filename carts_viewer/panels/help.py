@@ -112,7 +112,7 @@ HINTS = {
 
 
 def hint_with_keys(text: str, keys: Keys) -> str:
-    """A text with the keys of the actions that it names in braces."""
+    """Replace each name of an action in braces by the key of the action."""
     return re.sub(r"\{([^}]+)\}", lambda found: keys.get(found[1], found[0]), text)
 
 

@@ -90,7 +90,7 @@ class GroundTruth:
             seconds: computation time of the estimate [s].
             known: uncertainty of the estimate, if the optimizer reports it.
             loss: final loss of the optimizer.
-            whole: also compute the tip depth error and the second surface distance, the slowest metrics.
+            whole: also compute the tip depth error and `nsd_wide`, the slowest metrics.
         """
         state, scene = state.to("cpu"), renderer.scene
         names = [arm.name for arm in scene.arms]
@@ -113,7 +113,7 @@ class GroundTruth:
         return replace(score, tip_depth_mm=depth, nsd_wide=self._wide(mask))
 
     def with_wide(self, score: Score, state: SceneState, renderer: Renderer) -> Score:
-        """Add the second surface distance to the score of an estimate."""
+        """Add `nsd_wide` to the score of an estimate, if it is missing."""
         if score.nsd_wide is not None:
             return score
         return replace(score, nsd_wide=self._wide(renderer.segment(state.to("cpu"))[0] >= 0))
