@@ -22,6 +22,7 @@ from .options import RangedOptions, output_folder
 if TYPE_CHECKING:
     from ..batch.manifest import Job
     from ..files import OutputPath
+    from ..settings.optimization import Engine
 
 _BETWEEN_SUMMARIES = 1.0
 """Minimum interval between updates of throughput and cost [s]."""
@@ -96,7 +97,7 @@ class Batch(RangedOptions):
         from ..package_imports import require_package
         from .batch_job import BatchWork, with_project
 
-        work = BatchWork(folder, self.again, project=self.project)
+        work = BatchWork(folder, self.again, _inference(folder), self.project)
         workers = min(self.workers or os.cpu_count() or 1, len(jobs))
         if self.scheduler is None:
             engine = Pool(work, workers, self.threads)
@@ -144,3 +145,19 @@ def _roots(jobs: "list[Job]", folder: Path) -> str:
     parents = {os.path.dirname(job.recording) for job in jobs}
     outside = [parent for parent in parents if not f"{parent}{os.sep}".startswith(allowed)]
     return f" --root {shlex.quote(os.path.commonpath(outside))}" if outside else ""
+
+
+def _inference(folder: "OutputPath") -> "Engine":
+    """Inference engine of all jobs: the faster engine on the machine that started the batch."""
+    from ..files import holds_file, write_new
+    from ..files.reading import SETTINGS, read_text
+    from ..process import tune_process
+
+    path = folder / "inference.txt"
+    if not holds_file(path):
+        # Imported here, because it imports PyTorch, which a resumed batch does not need.
+        from ..networks.extractor import FeatureExtractor
+
+        tune_process()
+        write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
+    return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"

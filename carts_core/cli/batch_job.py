@@ -23,10 +23,9 @@ from ..batch.folder import (
 from ..batch.manifest import Job, Step
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
-from ..files import OutputPath, holds_file, remove_file, set_aside, write_new, write_text
-from ..files.reading import SETTINGS, read_text
+from ..files import OutputPath, remove_file, set_aside, write_text
 from ..process import processor_time, tune_process
-from ..settings.optimization import Engine
+from ..settings.optimization import Inference
 from .calibrate import Calibrate
 from .export import Export
 from .importing import Import
@@ -55,14 +54,14 @@ class BatchWork:
     Args:
         folder: folder of the batch.
         again: whether finished steps are repeated.
-        inference: inference engine of the surface network, unless the options of a step select another engine; None for
-            the faster engine on the machine that runs the first job, which all machines use.
+        inference: inference engine of the surface network on all machines, unless the options of a step select another
+            engine.
         project: whether the project beside a recording is applied; see `with_project`.
     """
 
     folder: OutputPath
     again: bool = False
-    inference: Engine | None = None
+    inference: Inference = "auto"
     project: Literal["beside", "none"] = "beside"
 
     def __call__(self, job: Job) -> Outcome:
@@ -133,7 +132,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
     project = with_project(job) if work.project == "beside" else None
     sequence = job.recording
     for step in job.steps:
-        options = (*job.options.get(step, ()), *_inference(step, job, work))
+        options = (*job.options.get(step, ()), *_inference(step, job, work.inference))
         if project is None and step in ("evaluate", "export") and not _given(options, "--project"):
             options = (*options, "--project", NO_PROJECT)
         inputs = [_inputs(Path(text)) for text in options]
@@ -168,22 +167,11 @@ def _measured(state: RunningJob, step: str, key: str) -> Iterator[None]:
     state.change(steps={**state.state.steps, step: StepState(key, seconds, processor)})
 
 
-def _inference(step: Step, job: Job, work: BatchWork) -> tuple[str, ...]:
+def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
     """Options that select the same inference engine on every machine, for steps that run the network on a CPU."""
     if step in ("import", "export") or _given(job.options.get(step, ()), "--device"):
         return ()
-    return ("--device", f"cpu:{work.inference or _common_engine(work.folder)}")
-
-
-def _common_engine(folder: OutputPath) -> Engine:
-    """Inference engine of all jobs; the first job selects it."""
-    path = folder / "inference.txt"
-    if not holds_file(path):
-        # Imported here, because other jobs do not need the network.
-        from ..networks.extractor import FeatureExtractor
-
-        write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
-    return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"
+    return ("--device", "cpu" if inference == "auto" else f"cpu:{inference}")
 
 
 def _given(options: Iterable[str], name: str) -> bool:

@@ -64,8 +64,8 @@ _STILL = 0.02
 _MIN_EXPLAINED, _MIN_GAIN = 0.15, 0.1
 """Minimum share of flow explained by the best delay, and its minimum relative reduction of the unexplained share
 compared with the median over the delays."""
-_MAX_DEVIATION = 0.04
-"""Maximum standard deviation of a reliable estimate [s]."""
+_MAX_DEVIATION = 0.02
+"""Maximum standard deviation of a reliable estimate [s]: half of a frame interval at 25 frames/s."""
 _MIN_DEVIATION = 0.001
 """Lower bound of the reported standard deviation [s]."""
 _WORTH_A_CHANGE = 3.0, 0.008
@@ -301,8 +301,16 @@ class _Delays:
         found = tuple(self._estimate(shifts, [n]) for n in moving)
         if _differ(found) and self._is_better(shifts, starts[0]):
             return found
-        apart = [each for each in found if each.others or _differ((each, replace(common, explained=1.0)))]
-        return (replace(common, alone={each.arm: (each.seconds, *each.others) for each in apart}),)
+        named = {}
+        for n, each in zip(moving, found, strict=True):
+            offsets, own = (each.seconds, *each.others), starts[1][n]
+            known = (*offsets, common.seconds)
+            # If the offset is ambiguous, the best one without the motion of the others is named, too.
+            if common.others and own is not None and min(abs(self._shared + own - offset) for offset in known) > _APART:
+                offsets = (*offsets, self._shared + self._refined([None] * len(every), [n], own))
+            if len(offsets) > 1 or _differ((each, replace(common, explained=1.0))):
+                named[each.arm] = offsets
+        return (replace(common, alone=named),)
 
     def _is_better(self, shifts: list[float | None], others: list[float | None]) -> bool:
         """Whether shifts explain more of the flow than others: much more, or significantly in a paired test over
