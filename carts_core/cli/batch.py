@@ -144,7 +144,9 @@ def _roots(jobs: "list[Job]", folder: Path) -> str:
     allowed = (f"{Path.cwd()}{os.sep}", f"{folder.absolute()}{os.sep}")
     parents = {os.path.dirname(job.recording) for job in jobs}
     outside = [parent for parent in parents if not f"{parent}{os.sep}".startswith(allowed)]
-    return f" --root {shlex.quote(os.path.commonpath(outside))}" if outside else ""
+    common = os.path.commonpath(outside) if outside else os.sep
+    # Folders without a common parent are left to the user.
+    return "" if common == os.sep else f" --root {shlex.quote(common)}"
 
 
 def _inference(folder: "OutputPath") -> "Engine":

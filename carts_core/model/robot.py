@@ -152,8 +152,8 @@ class Kinematics:
     """Forward kinematics of a robot's links from its independent joint positions.
 
     The transform of a link in its parent's frame is C + S sin(q) + G cos(q) + P q with constant matrices C, S, G and P,
-    where q is the position of the joint between them; see `_Joint.matrices`. The transforms of tensors are computed by
-    pytorch-kinematics, with gradients.
+    where q is the position of the joint between them; see `_Joint.matrices`. pytorch-kinematics computes the transforms
+    of tensors that require gradients or are on a GPU.
 
     Args:
         root: the checked URDF.

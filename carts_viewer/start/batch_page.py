@@ -59,7 +59,7 @@ class BatchPage:
         self._closed = threading.Event()
 
     def show(self) -> None:
-        """Update the document, and repeat the update."""
+        """Update the document, and repeat the update while a tab is open."""
         self._known = known_jobs(self._batch, self._jobs, self._known)
         with gc_paused():
             self._render()
@@ -164,7 +164,7 @@ class BatchPage:
 
         def update() -> None:
             self._waits = False
-            if not self._closed.is_set():
+            if not self._closed.is_set() and self._site.page.server.get_clients():
                 self.show()
 
         def wait() -> None:

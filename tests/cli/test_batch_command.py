@@ -73,6 +73,8 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
     told = said()
     assert "2 done" in told and re.search(r"2 jobs with 2 frames in \d+ s on 1 worker, [\d.e-]+ frames/s", told)
     assert "core hours" in told and "estimates for these jobs: 1 worker" in told
+    # The page has to be allowed to read recordings that are elsewhere.
+    assert f"cartsview{batch}--root{sequence.parent}" in "".join(told.split())
     for path in batch.glob("jobs/*/job.json"):
         steps = json.loads(path.read_text())["steps"]
         assert list(steps) == ["optimize", "findings", "export"] or list(steps) == ["optimize", "export", "findings"]
