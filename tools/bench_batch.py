@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import cv2
+import msgspec
 import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
@@ -91,7 +92,7 @@ def _write_job(
         {name: draw.uniform(0.1, 0.3, frames).round(6).tolist() for name in _JOINTS},
         {f"psm{arm} in left": np.eye(4).tolist() for arm in (1, 2)},
     )
-    _replace(place / FINDINGS_FILE, json.dumps(asdict(found)).encode())
+    _replace(place / FINDINGS_FILE, msgspec.json.encode(found))
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -154,8 +154,7 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
 FINDINGS_FILE = "findings.json"
 
 
-@dataclass(frozen=True)
-class FrameFinding:
+class FrameFinding(msgspec.Struct, frozen=True, gc=False):
     """Verdict on one frame, with its reason and probability."""
 
     camera: str
@@ -169,17 +168,16 @@ class FrameFinding:
     """Preview image in the job's folder; empty except for the worst frames."""
 
 
-@dataclass(frozen=True)
-class Findings:
+class Findings(msgspec.Struct, frozen=True, gc=False):
     """Results of a job."""
 
     recording: str
-    frames: list[FrameFinding] = field(default_factory=list)
-    corrections: dict[str, list[float]] = field(default_factory=dict)
+    frames: list[FrameFinding] = []
+    corrections: dict[str, list[float]] = {}
     """`ARM.JOINT` -> corrected minus measured position of each frame [deg, mm]."""
-    deviations: dict[str, list[float]] = field(default_factory=dict)
+    deviations: dict[str, list[float]] = {}
     """`ARM.JOINT` -> reported standard deviations [deg, mm] of the frames with known standard deviations."""
-    base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
+    base_frames: dict[str, list[list[float]]] = {}
     """`ARM in CAMERA`, or `ARM in the first frame of CAMERA` for a moving camera -> T_camera_base [4 x 4, m],
     calibrated if the job has a calibration step."""
     format: Literal["carts-findings/1"] = "carts-findings/1"

@@ -1,18 +1,17 @@
 """Results of a job: findings with preview images, written when it finishes, and projects for their review."""
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from ..errors import CartsError
 from ..export import KinematicsRow, outlined, read_kinematics_csv
 from ..export.kinematics import joint_columns, joint_units, position_values, std_values
-from ..files import OutputPath, holds_file, write_bytes, write_text
+from ..files import OutputPath, holds_file, write_bytes
 from ..files.reading import IMAGE, TABLE, read_bytes
 from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
 from ..provenance import Record, fingerprint, read_records
@@ -47,7 +46,7 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> Finding
             if (record := records.get(row.frame_id)) and record.verdict
         ]
         found.frames.extend(_pictured(folder, sequence, table.parent, frames))
-    write_text(folder / FINDINGS_FILE, json.dumps(asdict(found)))
+    write_bytes(folder / FINDINGS_FILE, msgspec.json.encode(found))
     return found
 
 
@@ -83,7 +82,7 @@ def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[F
         small = cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         name = f"worst-{part.name}-{frame.frame}.jpg"
         write_bytes(folder / name, cv2.imencode(".jpg", small[..., ::-1])[1].tobytes())
-        yield replace(frame, picture=name)
+        yield msgspec.structs.replace(frame, picture=name)
 
 
 _MADE = {"calibrate": "calibration", "import": "recording"}

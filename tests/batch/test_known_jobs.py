@@ -5,10 +5,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -52,7 +52,7 @@ def archive(folder: Path, frames: list[int], **unfinished: JobState) -> tuple[Ou
     write_jobs(batch, jobs)
     for name, found in zip(names, written, strict=True):
         write_state(batch / "jobs" / name, JobState("done", steps()))
-        write_text(batch / "jobs" / name / FINDINGS_FILE, json.dumps(asdict(found)))
+        write_text(batch / "jobs" / name / FINDINGS_FILE, msgspec.json.encode(found).decode())
     for name, state in unfinished.items():
         write_state(batch / "jobs" / name, state)
     return batch, jobs, written

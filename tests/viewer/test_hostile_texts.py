@@ -14,6 +14,7 @@ from itertools import count
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from playwright.sync_api import Browser
@@ -328,7 +329,7 @@ def test_texts_of_a_batch_stay_texts_in_its_page_and_in_its_report(
         base = {texts("base frame"): np.eye(4).tolist()}
         joint = {texts("arm") + "." + texts("joint"): [0.1, 0.2]}
         findings = Findings(texts("recording"), [frame], joint, joint, base)
-        content = {"format": "carts-findings/1", **asdict(findings)}
+        content = {"format": "carts-findings/1", **msgspec.to_builtins(findings)}
         (place.path / "findings.json").write_text(json.dumps(content))
     report = write_batch_report(output_path(batch), texts("title"), jobs)
     with Site([tmp_path], port=0, batch=batch) as site:
