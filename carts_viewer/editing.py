@@ -93,14 +93,13 @@ class People:
     def undo(self, person: Person) -> Change | None:
         """Undo the user's last step; None if there is no step to undo.
 
-        With several users, a later step without an owner is undone first. A single user without a step of their own
-        undoes the newest step.
+        A later step without an owner is undone first.
 
         Raises:
             CartsError: a later step has changed the same values.
             ProjectError: the change could not be saved.
         """
-        position, own = self.project.state.position, self._last(person, free=self.several)
+        position, own = self.project.state.position, self._last(person, free=True)
         if not self.several and own in (None, position):
             return self.project.go_to(max(position - 1, 0))
         if own is None:

@@ -346,6 +346,17 @@ def test_nobody_goes_back_over_the_steps_of_somebody_at_work(people: People) -> 
     assert people.project.state.position == 0
 
 
+def test_a_user_alone_undoes_the_newest_step_even_if_its_maker_has_left(people: People) -> None:
+    ann, bob = people.join(), people.join()
+    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
+    people.apply(bob, "Reject", {Key.review(2): REJECTED})
+    people.leave(bob)
+    people.undo(ann)
+    assert _reviews(people)[:3] == ["accepted", "untouched", "untouched"]
+    people.undo(ann)
+    assert _reviews(people)[0] == "untouched"
+
+
 def test_beside_others_ones_last_step_from_before_the_viewer_started_is_taken_back_and_theirs_are_not(
     people: People,
 ) -> None:
