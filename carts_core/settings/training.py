@@ -322,6 +322,8 @@ class TrainingConfig(Ranged):
         if self.cache is not None and self.network != "surface":
             raise SettingsError("an image cache is only supported for the surface network; leave out `cache`.")
         stride = (self.architecture if self.network == "feature" else self.surface_architecture).stride
+        if self.crop is not None and self.cache is None:
+            raise SettingsError("crop requires cached images; give `cache`, or leave out `crop`.")
         if self.crop is not None and (
             self.crop[0] not in range(stride, self.images.width + 1, stride)
             or self.crop[1] not in range(stride, self.images.height + 1, stride)

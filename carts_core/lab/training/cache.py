@@ -1,5 +1,4 @@
-"""Training images of the surface network on disk, generated once by several processes, read in random order and
-randomly changed.
+"""Training images of the surface network on disk, generated once by several processes and read in random order.
 
 A shard is a safetensors file of compressed samples: an image (PNG), its true surface map, and several prior surface
 maps from different kinematic errors.
@@ -10,7 +9,6 @@ import os
 import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,27 +19,17 @@ from safetensors import SafetensorError, safe_open
 
 from ...errors import WeightsError
 from ...files import output_path, write_bytes
-from ...model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
+from ...model.parts import SURFACE_CHANNELS
 from ...model.robot import Robot
 from ...networks.weights import tensor_bytes
 from ...settings import TrainingConfig
-from ..randomization import SURFACE_UNIT, SurfaceGenerator, SurfaceSample
+from ..randomization import SurfaceGenerator, SurfaceSample
 
 SHARD = 250
 """Images per shard."""
 PRIORS = 3
 """Prior surface maps per image."""
 _NICENESS = 5
-_CONTRAST, _EXPOSURE, _TINT, _GREY, _NOISY, _NOISE = (0.4, 1.2), (0.8, 1.2), 0.06, 0.1, 0.5, 8.0
-_PASTED, _WARPED, _MOVED, _OMITTED = 0.35, 0.5, 0.35, 0.12
-"""Shares of samples with arms of a second image, a rotated and enlarged image, a prior that is moved further, and no
-prior."""
-_ROTATION, _ZOOM = 20.0, (0.95, 1.45)
-"""Maximum rotation [deg] and range of the scale [1] of images."""
-_ANYWHERE = 0.4
-"""Share of crops that are not chosen around an arm."""
-_PRIOR_ROTATION, _PRIOR_ZOOM, _PRIOR_SHIFT = 6.0, 0.05, 9.0
-"""Standard deviations of the rotation [deg], logarithmic scale [1] and shift [px] of moved priors."""
 
 
 class ImageCache:
@@ -136,112 +124,6 @@ def _make(folder: Path, config: TrainingConfig, index: int) -> None:
         "offsets": torch.from_numpy(offsets),
     }
     write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, {}))
-
-
-def augmented(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Randomize contrast, exposure and white balance of a uint8 RGB image, and sometimes convert it to grey or add
-    noise."""
-    values = image.astype(np.float32)
-    mean = np.array(cv2.mean(image)[:3], np.float32)
-    values = mean + (values - mean) * np.float32(rng.uniform(*_CONTRAST))
-    values *= (rng.uniform(*_EXPOSURE) * np.clip(rng.normal(1, _TINT, 3), 0.8, 1.2)).astype(np.float32)
-    if rng.random() < _GREY:
-        values = np.repeat(values.mean(2, keepdims=True), 3, 2)
-    if rng.random() < _NOISY:
-        values += rng.uniform(0, _NOISE) * rng.standard_normal(values.shape, np.float32)
-    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
-
-
-def randomized(rng: np.random.Generator, cache: ImageCache, number: int, size: tuple[int, int]) -> SurfaceSample:
-    """Crop of a cached image with one of its priors, changed at random: colours, arms of a second image in front,
-    rotation and scale, and a moved or removed prior.
-
-    Args:
-        size: width and height of the crop [px], at most those of the image.
-    """
-    sample = _drawn(rng, cache, number)
-    if rng.random() < _PASTED:
-        sample = pasted(_drawn(rng, cache, int(rng.integers(len(cache)))), sample)
-    if rng.random() < _OMITTED:
-        sample = replace(sample, given=np.zeros_like(sample.given))
-    elif rng.random() < _MOVED:
-        sample = replace(sample, given=_moved(rng, sample.given))
-    corner = _corner(rng, sample, size)
-    if rng.random() >= _WARPED:
-        part = tuple(slice(start, start + length) for start, length in zip(corner[::-1], size[::-1], strict=True))
-        return SurfaceSample(sample.observed[part], sample.given[part], sample.surface[part])
-    centre = corner + np.array(size) / 2
-    A = cv2.getRotationMatrix2D(centre.tolist(), rng.uniform(-_ROTATION, _ROTATION), rng.uniform(*_ZOOM))
-    A[:, 2] -= corner
-    border = rng.uniform(0, 255, 3).tolist() if rng.random() < 0.5 else (0.0, 0.0, 0.0)
-    observed = cv2.warpAffine(sample.observed, A, size, borderValue=border)
-    return SurfaceSample(observed, warped_map(sample.given, A, size), warped_map(sample.surface, A, size))
-
-
-def _corner(rng: np.random.Generator, sample: SurfaceSample, size: tuple[int, int]) -> np.ndarray:
-    """Upper left corner of a random crop, mostly around a visible or prior arm pixel [px]."""
-    last = np.array([whole - part for whole, part in zip(sample.observed.shape[1::-1], size, strict=True)], int)
-    chosen = _covered(sample.surface if rng.random() < 0.7 else sample.given)
-    pixels = np.flatnonzero(chosen)
-    if not len(pixels) or rng.random() < _ANYWHERE:
-        return rng.integers(last + 1)
-    row, column = divmod(int(pixels[rng.integers(len(pixels))]), chosen.shape[1])
-    return np.clip([column, row] - rng.integers(size), 0, last)
-
-
-def _drawn(rng: np.random.Generator, cache: ImageCache, number: int) -> SurfaceSample:
-    image, truth, priors = cache[number]
-    return SurfaceSample(augmented(rng, image), priors[rng.integers(len(priors))], truth)
-
-
-def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:
-    """Image with the arms of `front` in front of `back`; priors are combined likewise."""
-    cover = _cover(front.surface)
-    observed = cover * front.observed + (1 - cover) * back.observed
-    given, surface = (
-        np.rint(ahead + (1 - _cover(ahead)) * behind).astype(np.int8)
-        for ahead, behind in ((front.given, back.given), (front.surface, back.surface))
-    )
-    return SurfaceSample((observed + 0.5).astype(np.uint8), given, surface)
-
-
-def _cover(surface: np.ndarray) -> np.ndarray:
-    """Share of each pixel that arms cover [h, w, 1]."""
-    return np.minimum(_covered(surface).astype(np.float32) / SURFACE_UNIT, 1)[..., None]
-
-
-def _covered(surface: np.ndarray) -> np.ndarray:
-    """Sum of the coverage of all parts, int16 [h, w]."""
-    # Faster than a sum over the last, short axis.
-    first, *others = np.moveaxis(surface[..., COVERAGE], -1, 0)
-    total = first.astype(np.int16)
-    for part in others:
-        total += part
-    return total
-
-
-def warped_map(surface: np.ndarray, A: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Surface map of width and height `size` [px] under a similarity transform of the image [2, 3], which rotates
-    normals about the optical axis."""
-    values = surface.astype(np.float32)
-    warped = np.dstack(
-        [cv2.warpAffine(np.ascontiguousarray(values[..., part]), A, size) for part in (COVERAGE, NORMALS)]
-    )
-    turn = A[:, :2] / np.sqrt(np.linalg.det(A[:, :2]))
-    flat = slice(NORMALS.start, NORMALS.start + 2)
-    warped[..., flat] = warped[..., flat] @ turn.T.astype(np.float32)
-    return np.rint(warped).astype(np.int8)
-
-
-def _moved(rng: np.random.Generator, given: np.ndarray) -> np.ndarray:
-    """Prior surface map, rotated about the centre of the visible arms, scaled and shifted at random."""
-    rows, columns = np.nonzero(_covered(given))
-    if not len(rows):
-        return given
-    centre = float(columns.mean()), float(rows.mean())
-    A = cv2.getRotationMatrix2D(centre, rng.normal(0, _PRIOR_ROTATION), np.exp(rng.normal(0, _PRIOR_ZOOM)))
-    A[:, 2] += rng.normal(0, _PRIOR_SHIFT, 2)
-    return warped_map(given, A, given.shape[1::-1])
 
 
 def _encoded(samples: list[SurfaceSample]) -> list[bytes]:

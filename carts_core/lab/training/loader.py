@@ -17,7 +17,8 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from ...settings import TrainingConfig
 from ...stopping import end_with_parent
-from .cache import ImageCache, randomized, shards
+from .augmentation import randomized
+from .cache import ImageCache, shards
 from .tasks import Batch, SurfaceTask, task_of
 
 VALIDATION_STREAM = 1

@@ -8,7 +8,8 @@ import pytest
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import SurfaceGenerator, SurfaceSample
 from carts_core.lab.training import cache
-from carts_core.lab.training.cache import ImageCache, augmented, make_cache, pasted, randomized, warped_map
+from carts_core.lab.training.augmentation import augmented, pasted, randomized, warped_map
+from carts_core.lab.training.cache import ImageCache, make_cache
 from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.training import train
 from carts_core.model.robot import Robot
@@ -118,3 +119,11 @@ def test_crops_are_mostly_around_arms(tmp_path: Path):
 def test_a_crop_larger_than_the_images_is_refused(tmp_path: Path):
     with pytest.raises(SettingsError, match=r"crop is \(96, 48\); give multiples of 16 up to 64 and 48"):
         config(tmp_path, crop=(96, 48))
+    with pytest.raises(SettingsError, match="crop requires cached images; give `cache`"):
+        config(tmp_path, cache=None, crop=(32, 16))
+
+
+def test_an_image_is_not_darkened():
+    image = np.full((40, 60, 3), 100, np.uint8)
+    means = [augmented(np.random.default_rng(seed), image).mean() for seed in range(200)]
+    assert np.mean(means) > 100 and np.quantile(means, 0.01) > 88  # A tint changes the mean by a few per cent.
