@@ -34,3 +34,8 @@ def shipped_weights() -> tuple[Path, Path]:
     """Weights of the shipped feature network and of the shipped surface network."""
     folder = sample_data_dir() / "weights"
     return folder / "features.safetensors", folder / "surface.safetensors"
+
+
+def shipped_int8() -> Path:
+    """The shipped surface network, quantized to 8-bit integers for ONNX Runtime (`tools/quantize_network.py`)."""
+    return sample_data_dir() / "weights" / "surface_int8.onnx"

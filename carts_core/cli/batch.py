@@ -150,7 +150,7 @@ def _roots(jobs: "list[Job]", folder: Path) -> str:
 
 
 def _inference(folder: "OutputPath") -> "Engine":
-    """Inference engine of all jobs: the faster engine on the machine that started the batch."""
+    """Inference engine of all jobs: the fastest engine on the machine that started the batch."""
     from ..files import holds_file, write_new
     from ..files.reading import SETTINGS, read_text
     from ..process import tune_process
@@ -162,4 +162,5 @@ def _inference(folder: "OutputPath") -> "Engine":
 
         tune_process()
         write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
-    return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"
+    found = read_text(path.path, SETTINGS)
+    return "int8" if found == "int8" else "onnx" if found == "onnx" else "torch"

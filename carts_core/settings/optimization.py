@@ -22,9 +22,10 @@ from .stages import (
     Stage,
 )
 
-Inference = Literal["auto", "torch", "onnx"]
-"""Inference engine: `torch`, `onnx` (ONNX Runtime on the CPU), or `auto` for the faster one if results agree."""
-Engine = Literal["torch", "onnx"]
+Inference = Literal["auto", "torch", "onnx", "int8"]
+"""Inference engine: `torch`, `onnx` (ONNX Runtime on the CPU), `int8` (the shipped network quantized to 8-bit integers,
+in ONNX Runtime), or `auto` for the fastest one if results agree."""
+Engine = Literal["torch", "onnx", "int8"]
 """Selected inference engine."""
 
 

@@ -1,4 +1,4 @@
-"""ONNX Runtime runs the surface network as torch does, or not at all."""
+"""ONNX Runtime runs the surface network as torch does, or quantized with a small difference, or not at all."""
 
 import json
 import os
@@ -11,10 +11,15 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
+from carts_core.imaging.working_image import stacked_images
+from carts_core.model.parts import COVERAGE
 from carts_core.networks import FeatureExtractor
-from carts_core.networks.extractor import TOLERANCE
+from carts_core.networks.engines import TOLERANCE
 from carts_core.networks.surface import UNetSurface
 from carts_core.networks.weights import save_weights
+from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
+from carts_core.resources import sample_sequence
 from carts_core.settings import Architecture
 
 
@@ -81,7 +86,7 @@ def test_a_gpu_predicts_what_a_cpu_predicts_and_gives_it_back_where_the_images_a
 
 def test_a_damaged_graph_is_exported_again(weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     graphs = {path: path.read_bytes() for path in cache.glob("surface-*.onnx")}
-    monkeypatch.setattr("carts_core.networks.extractor._exported", lambda network: pytest.fail("exported again"))
+    monkeypatch.setattr("carts_core.networks.engines.exported", lambda network: pytest.fail("exported again"))
     assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
     monkeypatch.undo()
     monkeypatch.setenv("CARTS_CACHE", str(cache))
@@ -98,24 +103,51 @@ def test_another_networks_graph_is_not_used(weights: Path, cache: Path) -> None:
     one.write_bytes(contents[1])
     other.write_bytes(contents[0])
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
-    with pytest.raises(SettingsError, match=r"cannot be used: (its surface maps differ|it cannot run)"):
+    with pytest.raises(SettingsError, match=r"cannot be used: (its surface maps differ|ONNX Runtime cannot run)"):
         FeatureExtractor.load(weights, inference="onnx")
 
 
-@pytest.mark.parametrize(("seconds", "engine"), [(0.5, "onnx"), (0.95, "torch"), (2.0, "torch")])
-def test_the_faster_engine_is_measured_once_and_remembered(
-    weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, seconds: float, engine: str
+@pytest.mark.parametrize(
+    ("onnx", "int8", "engine"),
+    [(0.5, 0.3, "int8"), (0.5, 0.47, "onnx"), (0.95, 0.92, "torch"), (2.0, 0.8, "int8"), (2.0, 2.0, "torch")],
+)
+def test_the_fastest_engine_is_measured_once_and_remembered(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, onnx: float, int8: float, engine: str
 ) -> None:
-    monkeypatch.setattr("carts_core.networks.extractor._times", lambda network, other: {"torch": 1.0, "onnx": seconds})
-    assert FeatureExtractor.load(weights, inference="auto").engine == engine
+    seconds = {"torch": 1.0, "onnx": onnx, "int8": int8}
+    monkeypatch.setattr("carts_core.networks.engines._times", lambda network, engines: seconds)
+    assert FeatureExtractor.load(inference="auto").engine == engine
     (remembered,) = cache.glob("inference-*.json")
     assert json.loads(remembered.read_text())["engine"] == engine
-    monkeypatch.setattr("carts_core.networks.extractor._times", lambda network, other: pytest.fail("measured again"))
-    assert FeatureExtractor.load(weights, inference="auto").engine == engine
+    monkeypatch.setattr("carts_core.networks.engines._times", lambda network, engines: pytest.fail("measured again"))
+    assert FeatureExtractor.load(inference="auto").engine == engine
+
+
+def test_the_quantized_network_predicts_nearly_what_torch_predicts() -> None:
+    sequence = Sequence.open(sample_sequence())
+    scene = sequence.scene
+    one, other = FeatureExtractor.load(), FeatureExtractor.load(inference="int8")
+    assert (other.engine, one.sha256) == ("int8", other.sha256) and one.fingerprint != other.fingerprint
+    renderer = Renderer(scene, width=320, height=240)
+    for domain in sequence.domains:
+        frame = sequence.frame(5, domain)
+        given = renderer.surface_maps(scene.state(frame.measured))
+        images = stacked_images(scene, frame.images, (320, 240), "image")
+        expected, found = one.surface(images, given), other.surface(images, given)
+        difference = (expected - found)[:, COVERAGE]
+        assert 1e-4 < float(difference.square().mean().sqrt()) < 0.015, domain
+        ours, theirs = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (found, expected))
+        assert 2 * int((ours & theirs).sum()) > 0.97 * int(ours.sum() + theirs.sum()), domain
+
+
+def test_weights_without_a_quantized_graph_are_refused_or_run_in_another_engine(weights: Path) -> None:
+    with pytest.raises(SettingsError, match="cannot be used: only the shipped weights have a quantized graph"):
+        FeatureExtractor.load(weights, inference="int8")
+    assert FeatureExtractor.load(weights, inference="auto").engine in ("torch", "onnx")
 
 
 def test_without_onnx_runtime_torch_runs(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("carts_core.networks.extractor.find_spec", lambda name: None)
+    monkeypatch.setattr("carts_core.networks.engines.find_spec", lambda name: None)
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
     with pytest.raises(SettingsError, match="onnxruntime and onnx are not installed"):
         FeatureExtractor.load(weights, inference="onnx")

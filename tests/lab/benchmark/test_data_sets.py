@@ -27,7 +27,7 @@ from carts_core.recording import Frame
 from carts_core.recording import Sequence as Recording
 from carts_core.rendering import Renderer
 
-FRAMES, WIDTH, HEIGHT, RATE, SEED = 150, 320, 240, 30, 3
+FRAMES, WIDTH, HEIGHT, RATE, SEED = 240, 320, 240, 30, 3
 ROWS_LATE = 6
 """Rows of the kinematics are this many frames late."""
 DOTS = {1: (0, (0.004, 0.0, -0.009)), 2: (1, (0.003, 0.001, 0.003)), 3: (2, (0.0, 0.002, 0.001)), 7: (0, (0, 0.004, 0))}
