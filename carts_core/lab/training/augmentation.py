@@ -7,7 +7,7 @@ import numpy as np
 
 from ...model.parts import COVERAGE, NORMALS
 from ..randomization import SURFACE_UNIT, SurfaceSample
-from .cache import ImageCache
+from .cache import PRIORS, ImageCache
 
 _CONTRAST = 0.4, 1.2
 """Range of the factor of differences from the mean colour [1]."""
@@ -32,17 +32,22 @@ _PRIOR_ROTATION, _PRIOR_ZOOM, _PRIOR_SHIFT = 6.0, 0.05, 9.0
 
 
 def augmented(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Randomize contrast, exposure and white balance of a uint8 RGB image, and sometimes convert it to grey or add
-    noise."""
-    values = image.astype(np.float32)
-    mean = np.array(cv2.mean(image)[:3], np.float32)
-    values = mean + (values - mean) * np.float32(rng.uniform(*_CONTRAST))
-    values *= (rng.uniform(*_EXPOSURE) * np.clip(rng.normal(1, _TINT, 3), 0.8, 1.2)).astype(np.float32)
+    """Randomize contrast, exposure and white balance of a uint8 RGB image, and sometimes convert it to grey."""
+    mean = np.array(cv2.mean(image)[:3])
+    contrast, gains = rng.uniform(*_CONTRAST), rng.uniform(*_EXPOSURE) * np.clip(rng.normal(1, _TINT, 3), 0.8, 1.2)
+    table = gains * (mean + contrast * (np.arange(256)[:, None] - mean))
+    changed = cv2.LUT(image, np.clip(table + 0.5, 0, 255).astype(np.uint8)[None])
     if rng.random() < _GREY:
-        values = np.repeat(values.mean(2, keepdims=True), 3, 2)
-    if rng.random() < _NOISY:
-        values += rng.uniform(0, _NOISE) * rng.standard_normal(values.shape, np.float32)
-    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
+        changed = cv2.cvtColor(cv2.transform(changed, np.full((1, 3), 1 / 3)), cv2.COLOR_GRAY2RGB)
+    return changed
+
+
+def noisy(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """Sometimes add Gaussian noise to a uint8 image."""
+    if rng.random() >= _NOISY:
+        return image
+    noise = np.float32(rng.uniform(0, _NOISE)) * rng.standard_normal(image.shape, np.float32)
+    return np.clip(image + noise + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
 def randomized(rng: np.random.Generator, cache: ImageCache, number: int, size: tuple[int, int]) -> SurfaceSample:
@@ -62,13 +67,13 @@ def randomized(rng: np.random.Generator, cache: ImageCache, number: int, size: t
     corner = _corner(rng, sample, size)
     if rng.random() >= _WARPED:
         part = tuple(slice(start, start + length) for start, length in zip(corner[::-1], size[::-1], strict=True))
-        return SurfaceSample(sample.observed[part], sample.given[part], sample.surface[part])
+        return SurfaceSample(noisy(rng, sample.observed[part]), sample.given[part], sample.surface[part])
     centre = corner + np.array(size) / 2
     A = cv2.getRotationMatrix2D(centre.tolist(), rng.uniform(-_ROTATION, _ROTATION), rng.uniform(*_ZOOM))
     A[:, 2] -= corner
     border = rng.uniform(0, 255, 3).tolist() if rng.random() < 0.5 else (0.0, 0.0, 0.0)
     observed = cv2.warpAffine(sample.observed, A, size, borderValue=border)
-    return SurfaceSample(observed, warped_map(sample.given, A, size), warped_map(sample.surface, A, size))
+    return SurfaceSample(noisy(rng, observed), warped_map(sample.given, A, size), warped_map(sample.surface, A, size))
 
 
 def _corner(rng: np.random.Generator, sample: SurfaceSample, size: tuple[int, int]) -> np.ndarray:
@@ -83,8 +88,8 @@ def _corner(rng: np.random.Generator, sample: SurfaceSample, size: tuple[int, in
 
 
 def _drawn(rng: np.random.Generator, cache: ImageCache, number: int) -> SurfaceSample:
-    image, truth, priors = cache[number]
-    return SurfaceSample(augmented(rng, image), priors[rng.integers(len(priors))], truth)
+    image, truth, given = cache.sample(number, int(rng.integers(PRIORS)))
+    return SurfaceSample(augmented(rng, image), given, truth)
 
 
 def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:

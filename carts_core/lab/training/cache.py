@@ -54,19 +54,19 @@ class ImageCache:
     def __len__(self) -> int:
         return SHARD * len(self._files)
 
-    def __getitem__(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image uint8 [h, w, 3], true surface map and prior surface maps, int8 [h, w, 6] and [priors, h, w, 6]."""
+    def sample(self, number: int, prior: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Image uint8 [h, w, 3], true surface map and one of the prior surface maps, int8 [h, w, 6]."""
         shard, index = divmod(number, SHARD)
         offsets, values = self._offsets[shard], self._files[shard].get_slice("samples")
         first = index * (2 + PRIORS)
-        parts = [
-            values[int(offsets[first + k]) : int(offsets[first + k + 1])].numpy().tobytes() for k in range(2 + PRIORS)
-        ]
-        image = cv2.imdecode(np.frombuffer(parts[0], np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None
-        shape = *image.shape[:2], SURFACE_CHANNELS
-        truth, *priors = (np.frombuffer(zlib.decompress(part), np.int8).reshape(shape) for part in parts[1:])
-        return image, truth, np.stack(priors)
+        image, *maps = (
+            values[int(offsets[k]) : int(offsets[k + 1])].numpy() for k in (first, first + 1, first + 2 + prior)
+        )
+        decoded = cv2.imdecode(image, cv2.IMREAD_COLOR)
+        assert decoded is not None
+        shape = *decoded.shape[:2], SURFACE_CHANNELS
+        truth, given = (np.frombuffer(zlib.decompress(part), np.int8).reshape(shape) for part in maps)
+        return decoded, truth, given
 
 
 def make_cache(
