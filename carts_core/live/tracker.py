@@ -70,6 +70,8 @@ class LiveEstimate:
 
 CHANGED = 0.5
 """Change of thumbnails above which the scene is considered different; equivalent to a correlation of one half [1]."""
+_LOOK_EVERY = 8
+"""Default number of frames from one evaluation of the network to the next while colours identify the arms [1]."""
 _SIZE = (32, 24)
 """Width and height of thumbnails [px]."""
 
@@ -173,7 +175,7 @@ class LiveTracker:
         scene: arms and cameras.
         networks: the networks, or a predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `live`.
-        model: model of the measurement error.
+        model: model of the measurement error; by default with the network in every eighth frame.
         live: stages, and thresholds for lost arms.
         free: free parameters.
         backgrounds: backgrounds of the cameras; detections in them are false positives.
@@ -200,7 +202,7 @@ class LiveTracker:
     ) -> None:
         self.settings, self.live, self.verdict = settings or SurfaceSolver(), live or LiveSettings(), LiveVerdict.LOST
         self._scene, self._predictor = scene.with_cameras(cameras), predictor_of(networks)
-        self._model, self._free = model or SequenceSettings(), free or FreeParameters()
+        self._model, self._free = model or SequenceSettings(look_every=_LOOK_EVERY), free or FreeParameters()
         stages: dict[str, tuple[Stage, ...]] = {
             Effort.SMALL: self.live.small,
             Effort.FULL: self.live.full,

@@ -306,12 +306,12 @@ class SequenceOptimizer:
         """Assess all estimates, then solve failed frames individually if there are no keyframes and only joints are
         free; yield each new estimate."""
         failed, corrections = [], self._smoother.smoothed()
-        looked = sorted(index for index, visit in self._visits.items() if not visit.measurement.by_colours)
+        alone = self._assessed_alone()
         known: dict[int, Assessment] = {}
-        # Frames without the network come last, since their verdicts depend on the neighbouring frames with it.
-        for index in sorted(self._visits, key=lambda index: self._visits[index].measurement.by_colours):
+        # The other frames come last, since their verdicts depend on these frames.
+        for index in sorted(self._visits, key=lambda index: index not in alone):
             began, estimate = time.perf_counter(), self.estimates[index]
-            found = self._between_good_frames(index, looked, known)
+            found = None if index in alone else self._between_good_frames(index, alone, known)
             if found is None:
                 frame, variables = self._open(index)
                 found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
@@ -337,15 +337,22 @@ class SequenceOptimizer:
             if in_vain == _IN_VAIN:
                 return
 
+    def _assessed_alone(self) -> list[int]:
+        """Frames that get their own verdict: those that needed the network, and a few routine ones."""
+        chosen, since = [], self.model.assess_every
+        for index in sorted(self._visits):
+            visit, since = self._visits[index], since + 1
+            if not (visit.measurement.by_colours or (visit.routine and since < self.model.assess_every)):
+                chosen.append(index)
+                since = 0
+        return chosen
+
     def _between_good_frames(
-        self, index: int, looked: Sequence[int], known: Mapping[int, Assessment]
+        self, index: int, alone: Sequence[int], known: Mapping[int, Assessment]
     ) -> Assessment | None:
-        """Verdict on a frame whose colours agree with the fit: the less certain one of the network's frames
-        before and after it, if both are good; None for other frames."""
-        if not self._visits[index].measurement.by_colours:
-            return None
-        place = bisect(looked, index)
-        beside = [known[other] for other in looked[max(place - 1, 0) : place + 1]]
+        """The less certain one of the verdicts before and after a frame, if both are good; None otherwise."""
+        place = bisect(alone, index)
+        beside = [known[other] for other in alone[max(place - 1, 0) : place + 1]]
         if not beside or any(one.verdict is not Verdict.GOOD for one in beside):
             return None
         return max(beside, key=lambda one: one.probability)
@@ -385,7 +392,7 @@ class SequenceOptimizer:
             corrections = {alone: visit.measurement.correction for alone, visit in self._initial.items()}
             self._initial_correction = initial_correction(corrections, self._solver, self._open, self.model.cold_factor)
         frame, variables = self._open(index)
-        expected = self._smoother.expected(index)
+        expected, routine = self._smoother.expected(index), False
         if index in self._keyframes:
             start, measurement = Origin.KEYFRAME, self._keyframe(frame, variables, expected)
         elif self._visits and (found := self._tracker.measured(self._solver, frame, variables, expected)) is not None:
@@ -394,6 +401,7 @@ class SequenceOptimizer:
             start, measurement, lost = self._measure(frame, variables, expected)
             contradicts = bool(self._visits) and measurement.information.contradicts(expected)
             usual = not (lost or contradicts) and measurement.loss <= self._unusual_loss()
+            routine = usual and start is Origin.WARM and self._tracker.ready
             self._tracker.learn(self._solver, frame, variables, measurement, usual)
             if contradicts:
                 # If the image fits badly, it is ignored; otherwise the prediction is wrong, and the filter restarts.
@@ -406,7 +414,7 @@ class SequenceOptimizer:
             seconds += sum(visit.seconds for visit in self._initial.values())
             before = sum(visit.measurement.iterations for visit in self._initial.values())
             measurement = replace(measurement, iterations=measurement.iterations + before)
-        visit = self._visits[index] = Visit(frame.frame_id, variables, measurement, start, seconds)
+        visit = self._visits[index] = Visit(frame.frame_id, variables, measurement, start, seconds, routine)
         self._estimates = None
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 

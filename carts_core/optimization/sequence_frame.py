@@ -342,6 +342,11 @@ class ColourTracker:
         """Whether the next frame requires the network even if the colours fit well."""
         return self._since + 1 >= self._model.look_every
 
+    @property
+    def ready(self) -> bool:
+        """Whether the next frame requires the network at most because it is due."""
+        return self._colours is not None and self._pause == 0
+
     def measured(
         self,
         solver: SequenceFrameSolver,
@@ -356,7 +361,7 @@ class ColourTracker:
         Args:
             overdue: whether the frame is measured without the network even if the network is due.
         """
-        if self._colours is None or self._pause > 0 or (self.due and not overdue) or solver.masked(frame):
+        if not self.ready or self._colours is None or (self.due and not overdue) or solver.masked(frame):
             return None
         (stage,) = self._model.between
         assert isinstance(stage, AlignRegions)
@@ -523,6 +528,8 @@ class Visit:
     measurement: Measurement
     start: Origin
     seconds: float
+    routine: bool = False
+    """Whether the network was evaluated only because it was due, with the usual result."""
 
     def estimate(self, scene: Scene, index: int, correction: Gaussian, prior: Gaussian) -> FrameEstimate:
         """Estimate of the frame for a correction of the measured values [rad], given the prior before any image."""

@@ -71,8 +71,11 @@ class SequenceSettings(Ranged):
     """Stages after `warm` ends with an unusual loss, before a cold start."""
     between: tuple[Stage, ...] = BETWEEN
     """`AlignRegions`, for frames without the network; empty to evaluate the network in every frame."""
-    look_every: Annotated[int, Range(1, 1000)] = 8
+    look_every: Annotated[int, Range(1, 1000)] = 3
     """Number of frames from one evaluation of the network to the next while `between` fits well [1]."""
+    assess_every: Annotated[int, Range(1, 1000)] = 8
+    """Number of frames from one assessment to the next while `between` fits well; verdicts of the frames in between are
+    those of their neighbours [1]."""
     min_likelihood: Annotated[float, Range(-2, 2)] = 0.4
     """Mean log odds of the colours at the outlines of an arm below which the network is needed [1]."""
 
