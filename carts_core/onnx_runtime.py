@@ -6,6 +6,8 @@ From version 1.29, ONNX Runtime by default sends telemetry on the machine and it
 import os
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .process import memory_kept
 
 if TYPE_CHECKING:
@@ -41,3 +43,24 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
         return onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"], disabled_optimizers=left_out)
     except Exception as error:  # Exceptions of ONNX Runtime have no more specific base class.
         raise RuntimeError(str(error)) from error
+
+
+def exact_int8() -> bool:
+    """Whether products of 8-bit integers are exact; on x86 processors without VNNI instructions, their sums saturate.
+
+    Raises:
+        ImportError: ONNX or ONNX Runtime is not installed.
+        RuntimeError: ONNX Runtime cannot multiply 8-bit integers.
+    """
+    from onnx import TensorProto, helper  # noqa: PLC0415
+
+    side, largest = 64, (255, 127)
+    kinds = {"a": TensorProto.UINT8, "b": TensorProto.INT8, "product": TensorProto.INT32}
+    *inputs, output = (helper.make_tensor_value_info(name, kind, [side, side]) for name, kind in kinds.items())
+    product = helper.make_node("MatMulInteger", ["a", "b"], ["product"])
+    graph = helper.make_graph([product], "product", inputs, [output])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    session = inference_session(model.SerializeToString(), 1)
+    factors = (np.full((side, side), value, kind) for value, kind in zip(largest, (np.uint8, np.int8), strict=True))
+    (found,) = session.run(["product"], dict(zip("ab", factors, strict=True)))
+    return bool((np.asarray(found) == side * largest[0] * largest[1]).all())

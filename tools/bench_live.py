@@ -35,7 +35,7 @@ def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, o
     sequence = Sequence.open(sample_sequence())
     camera = sequence.scene.cameras[0].name
     scene = replace(sequence.scene, arms=sequence.scene.arms[:arms])
-    extractor = FeatureExtractor.load(inference="onnx")
+    extractor = FeatureExtractor.load(inference="auto")
     backgrounds = Backgrounds.of(sequence, (camera,), domain)
     tracker = LiveTracker(scene, extractor, backgrounds=backgrounds, cameras=(camera,), concurrent=True)
     renderer, memory, scores = Renderer(scene, cameras=[camera]), [], []

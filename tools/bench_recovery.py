@@ -11,6 +11,7 @@ import argparse
 import json
 import time
 from dataclasses import replace
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from carts_core.process import tune_process
 from carts_core.recording import Frame, Sequence
 from carts_core.resources import sample_sequence
 from carts_core.settings.live import LiveSettings
+from carts_core.settings.optimization import Inference
 
 _BEFORE, _HIDDEN, _AFTER = 1.0, 2.0, 3.0
 """Seconds before, during and after an occlusion."""
@@ -39,11 +41,11 @@ visible."""
 class _Clock:
     """A tracker with simulated time, or real time with `wall` [s]."""
 
-    def __init__(self, arms: int, rate: float, wall: bool = False) -> None:
+    def __init__(self, arms: int, rate: float, wall: bool, inference: Inference) -> None:
         self.sequence = Sequence.open(sample_sequence())
         (self.camera,) = self.sequence.scene.cameras
         self.scene = replace(self.sequence.scene, arms=self.sequence.scene.arms[:arms])
-        self.extractor, self.rate, self.now = FeatureExtractor.load(inference="onnx"), rate, 0.0
+        self.extractor, self.rate, self.now = FeatureExtractor.load(inference=inference), rate, 0.0
         self.wall, self.tracker = wall, None
         self.frames = [self.sequence.frame(index, None, [self.camera.name]) for index in range(len(self.sequence))]
         self.known = Backgrounds.of(self.sequence, (self.camera.name,), self.frames[0].domain)
@@ -147,10 +149,11 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--wall", action="store_true")
+    parser.add_argument("--inference", choices=get_args(Inference), default="auto")
     arguments = parser.parse_args()
     tune_process()
     torch.set_num_threads(1)
-    clock = _Clock(arguments.arms, arguments.rate, arguments.wall)
+    clock = _Clock(arguments.arms, arguments.rate, arguments.wall, arguments.inference)
     ratios = [noise_of_still(clock, arguments.seconds, index) for index in (0, 20, 40)] if arguments.seconds else []
     found = [recovered(clock, seed) for seed in range(arguments.first, arguments.first + arguments.runs)]
     seconds = sorted(one for one, _ in found)

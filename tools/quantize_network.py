@@ -63,8 +63,6 @@ def main() -> None:
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=_OPERATIONS,
             per_channel=True,
-            # With 8 bits, processors without VNNI instructions saturate.
-            reduce_range=True,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             # The last convolution predicts log odds and normals.

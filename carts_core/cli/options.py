@@ -229,8 +229,8 @@ class Network:
     device: str = "cpu"
     """Device of the networks: `cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU, the surface network runs in
     torch, in ONNX Runtime (results agree to 1e-4), or quantized to 8-bit integers (root mean square difference of
-    coverage 0.006; only shipped weights), whichever is fastest in a benchmark that runs once; `cpu:torch`, `cpu:onnx`
-    and `cpu:int8` select the engine.
+    coverage 0.006; only shipped weights, on x86 with VNNI instructions), whichever is fastest in a benchmark that runs
+    once; `cpu:torch`, `cpu:onnx` and `cpu:int8` select the engine.
     """
 
     def __post_init__(self) -> None:

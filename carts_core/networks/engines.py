@@ -28,7 +28,7 @@ from ..files import output_path, write_bytes, write_new
 from ..files.reading import VALUES, WEIGHTS, parse_json, read_bytes
 from ..model.mesh_cache import cache_dir
 from ..model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
-from ..onnx_runtime import inference_session
+from ..onnx_runtime import exact_int8, inference_session
 from ..process import inference_threads
 from ..provenance import fingerprint
 from ..resources import shipped_int8
@@ -147,7 +147,7 @@ _MEASUREMENT = 3
 _PROBE = 7, 13
 """Height and width of the timed image, in strides of the network; typical of a window around an arm."""
 
-_PACKAGES: dict[Engine, tuple[str, ...]] = {"onnx": ("onnxruntime", "onnx"), "int8": ("onnxruntime",)}
+_PACKAGES: dict[Engine, tuple[str, ...]] = dict.fromkeys(("onnx", "int8"), ("onnxruntime", "onnx"))
 
 
 def surface_engine(
@@ -177,6 +177,8 @@ def _checked(name: Engine, network: AnySurfaceNetwork, sha256: str, device: torc
         raise RuntimeError(f"{' and '.join(absent)} {'is' if len(absent) == 1 else 'are'} not installed")
     if device.type != "cpu":
         raise RuntimeError(f"it requires the device cpu; given: {device}")
+    if name == "int8" and not exact_int8():
+        raise RuntimeError("sums of 8-bit products saturate on this processor")
     make = OnnxSurface.int8 if name == "int8" else OnnxSurface.float32
     found = make(network, sha256)
     difference = _deviation(network, found) if name == "int8" else _difference(network, found)

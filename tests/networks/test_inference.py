@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,6 +18,7 @@ from carts_core.networks import FeatureExtractor
 from carts_core.networks.engines import TOLERANCE
 from carts_core.networks.surface import UNetSurface
 from carts_core.networks.weights import save_weights
+from carts_core.onnx_runtime import exact_int8, inference_session
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
@@ -138,6 +140,24 @@ def test_the_quantized_network_predicts_nearly_what_torch_predicts() -> None:
         assert 1e-4 < float(difference.square().mean().sqrt()) < 0.015, domain
         ours, theirs = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (found, expected))
         assert 2 * int((ours & theirs).sum()) > 0.97 * int(ours.sum() + theirs.sum()), domain
+
+
+def test_where_sums_of_8_bit_products_saturate_the_network_is_not_quantized(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Saturating:
+        """As x86 processors without VNNI: sums of two products have 16 bits."""
+
+        def run(self, outputs: list[str], factors: dict[str, np.ndarray]) -> list[np.ndarray]:
+            a, b = (factors[name].astype(np.int64) for name in "ab")
+            pairs = a[:, None, ::2] * b.T[None, :, ::2] + a[:, None, 1::2] * b.T[None, :, 1::2]
+            return [pairs.clip(-(2**15), 2**15 - 1).sum(2).astype(np.int32)]
+
+    assert exact_int8() in (True, False)
+    monkeypatch.setattr("carts_core.onnx_runtime.inference_session", lambda *_: Saturating())
+    assert not exact_int8()
+    monkeypatch.setattr("carts_core.networks.engines.inference_session", inference_session)
+    assert FeatureExtractor.load(inference="auto").engine in ("torch", "onnx")
+    with pytest.raises(SettingsError, match="cannot be used: sums of 8-bit products saturate on this processor"):
+        FeatureExtractor.load(inference="int8")
 
 
 def test_weights_without_a_quantized_graph_are_refused_or_run_in_another_engine(weights: Path) -> None:
