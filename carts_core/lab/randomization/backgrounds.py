@@ -285,12 +285,16 @@ _BOARD = np.array(
 )  # fmt: skip
 
 
-def random_background(rng: np.random.Generator, width: int, height: int) -> Image:
+def random_background(rng: np.random.Generator, width: int, height: int, tissue: float = 0.0) -> Image:
     """Random background without shadows, clutter or camera effects, RGB in [0, 1].
 
     The mean brightness is at least about 0.25, since training data exclude low light.
+
+    Args:
+        tissue: share of backgrounds that are tissue; the others have the usual distribution, which includes tissue [1].
     """
-    name = rng.choice(list(_SHARES), p=list(_SHARES.values()))
+    always = tissue > 0.0 and rng.random() < tissue
+    name = "tissue" if always else rng.choice(list(_SHARES), p=list(_SHARES.values()))
     image = MAKERS[name](rng, width, height).astype(np.float32)
     image = np.clip(image, 0, 1)
     mean = image.mean()

@@ -33,7 +33,9 @@ SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 80
 """Number of images after which the next entry of the pool is renewed."""
-_OBSERVATIONS, _SCENES = 0, 1
+_OBSERVATIONS, _SCENES, _EMPTY = 0, 1, 2
+_TISSUE = 0.6
+"""Minimum share of tissue among scenes without arms, which are generated for more variety behind the arms."""
 """Indices of the random streams."""
 _TRIES = 12
 _FAR = 100.0
@@ -101,6 +103,13 @@ class Observer:
             image, variant, placements, claimed, intrinsics, view, fine, coverage, background, camera_seed
         )
 
+    def scene(self, number: int) -> Float[np.ndarray, "h w 3"]:
+        """Image `number` of a scene without arms."""
+        self.rng = rng = np.random.default_rng((*self._seed, _EMPTY, number))
+        size = self.settings.width, self.settings.height
+        intrinsics = random_intrinsics(rng, *size, self.settings.field_width)
+        return photograph(rng, self._background(intrinsics, *size, _TISSUE), self.settings.appearance)
+
     def _variant(self, arms: int, number: int) -> Variant:
         """Scene from a small pool with gradual renewal, since creating a scene takes as long as several images."""
         place, settings = int(self.rng.integers(_VARIANTS)), self.settings
@@ -161,12 +170,14 @@ class Observer:
             for placement, away in zip(placements, gone, strict=True)
         ]
 
-    def _background(self, intrinsics: Intrinsics, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
+    def _background(
+        self, intrinsics: Intrinsics, width: int, height: int, tissue: float = 0.0
+    ) -> Float[np.ndarray, "h w 3"]:
         rng, settings = self.rng, self.settings
         if self._photographs is not None and rng.random() < settings.from_photographs:
             image = self._photographs(rng, width, height)
         else:
-            image = add_clutter(rng, random_background(rng, width, height))
+            image = add_clutter(rng, random_background(rng, width, height, tissue))
         if rng.random() < settings.things:
             image = add_objects(rng, image, intrinsics)
         return image.astype(np.float32)
@@ -332,6 +343,10 @@ class SurfaceGenerator:
     def __call__(self, number: int | None = None) -> SurfaceSample:
         """Generate surface sample `number`, counted from 0; by default, the next one."""
         return self.samples(number, 1)[0]
+
+    def scene(self, number: int) -> Int[np.ndarray, "h w 3"]:
+        """Image `number` of a scene without arms, RGB uint8."""
+        return to_uint8(self._observer.scene(number))
 
     def samples(self, number: int | None, priors: int) -> list[SurfaceSample]:
         """Generate samples of one image with `priors` different prior surface maps."""

@@ -18,16 +18,18 @@ _GREY, _NOISY = 0.1, 0.5
 """Shares of grey images and of images with added noise."""
 _NOISE = 8.0
 """Maximum standard deviation of added noise [8-bit values]."""
-_PASTED, _WARPED, _MOVED, _OMITTED = 0.35, 0.5, 0.35, 0.12
+_ELSEWHERE, _ABSENT = 0.42, 0.12
+"""Shares of samples whose arms are pasted into another scene, and of scenes without arms."""
+_PASTED, _WARPED, _MOVED, _OMITTED = 0.35, 0.5, 0.45, 0.12
 """Shares of samples with arms of a second image, a rotated and enlarged image, a prior that is moved further, and no
 prior."""
 _ROTATION, _ZOOM = 20.0, (0.95, 1.45)
 """Maximum rotation [deg] and range of the scale [1] of images."""
-_ANYWHERE = 0.4
+_ANYWHERE = 0.5
 """Share of crops that are not chosen around an arm."""
 _VISIBLE = 0.7
 """Share of the other crops that are chosen around visible arms, instead of those of the prior."""
-_PRIOR_ROTATION, _PRIOR_ZOOM, _PRIOR_SHIFT = 6.0, 0.05, 9.0
+_PRIOR_ROTATION, _PRIOR_ZOOM, _PRIOR_SHIFT = 8.0, 0.08, 14.0
 """Standard deviations of the rotation [deg], logarithmic scale [1] and shift [px] of moved priors."""
 
 
@@ -51,8 +53,8 @@ def noisy(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
 
 
 def randomized(rng: np.random.Generator, cache: ImageCache, number: int, size: tuple[int, int]) -> SurfaceSample:
-    """Crop of a cached image with one of its priors, changed at random: colours, arms of a second image in front,
-    rotation and scale, and a moved or removed prior.
+    """Crop of a cached image with one of its priors, changed at random: colours, another scene, arms of a second image
+    in front, rotation and scale, and a moved or removed prior.
 
     Args:
         size: width and height of the crop [px], at most those of the image.
@@ -88,8 +90,15 @@ def _corner(rng: np.random.Generator, sample: SurfaceSample, size: tuple[int, in
 
 
 def _drawn(rng: np.random.Generator, cache: ImageCache, number: int) -> SurfaceSample:
+    """Sample with its own scene, with another scene, or without its arms."""
     image, truth, given = cache.sample(number, int(rng.integers(PRIORS)))
-    return SurfaceSample(augmented(rng, image), given, truth)
+    sample, chance = SurfaceSample(augmented(rng, image), given, truth), rng.random()
+    if chance >= _ELSEWHERE + _ABSENT:
+        return sample
+    scene, nothing = augmented(rng, cache.scene(int(rng.integers(cache.scenes)))), np.zeros_like(truth)
+    if chance < _ABSENT:
+        return SurfaceSample(scene, given, nothing)
+    return pasted(sample, SurfaceSample(scene, nothing, nothing))
 
 
 def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:

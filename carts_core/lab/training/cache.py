@@ -1,7 +1,7 @@
 """Training images of the surface network on disk, generated once by several processes and read in random order.
 
-A shard is a safetensors file of compressed samples: an image (PNG), its true surface map, and several prior surface
-maps from different kinematic errors.
+A shard is a safetensors file of images of scenes without arms (PNG), and of compressed samples: an image (PNG), its
+true surface map, and several prior surface maps from different kinematic errors.
 """
 
 import multiprocessing
@@ -29,6 +29,8 @@ SHARD = 250
 """Images per shard."""
 PRIORS = 3
 """Prior surface maps per image."""
+SCENES = 100
+"""Images of scenes without arms per shard."""
 _NICENESS = 5
 
 
@@ -54,19 +56,35 @@ class ImageCache:
     def __len__(self) -> int:
         return SHARD * len(self._files)
 
+    @property
+    def scenes(self) -> int:
+        """Number of scenes without arms."""
+        return SCENES * len(self._files)
+
+    def scene(self, number: int) -> np.ndarray:
+        """Image of a scene without arms, uint8 [h, w, 3]."""
+        shard, index = divmod(number, SCENES)
+        return _image(*self._parts(shard, [index]))
+
     def sample(self, number: int, prior: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Image uint8 [h, w, 3], true surface map and one of the prior surface maps, int8 [h, w, 6]."""
         shard, index = divmod(number, SHARD)
-        offsets, values = self._offsets[shard], self._files[shard].get_slice("samples")
-        first = index * (2 + PRIORS)
-        image, *maps = (
-            values[int(offsets[k]) : int(offsets[k + 1])].numpy() for k in (first, first + 1, first + 2 + prior)
-        )
-        decoded = cv2.imdecode(image, cv2.IMREAD_COLOR)
-        assert decoded is not None
-        shape = *decoded.shape[:2], SURFACE_CHANNELS
-        truth, given = (np.frombuffer(zlib.decompress(part), np.int8).reshape(shape) for part in maps)
-        return decoded, truth, given
+        first = SCENES + index * (2 + PRIORS)
+        part, *maps = self._parts(shard, [first, first + 1, first + 2 + prior])
+        image = _image(part)
+        shape = *image.shape[:2], SURFACE_CHANNELS
+        truth, given = (np.frombuffer(zlib.decompress(each), np.int8).reshape(shape) for each in maps)
+        return image, truth, given
+
+    def _parts(self, shard: int, numbers: list[int]) -> list[np.ndarray]:
+        offsets, values = self._offsets[shard], self._files[shard].get_slice("images")
+        return [values[int(offsets[number]) : int(offsets[number + 1])].numpy() for number in numbers]
+
+
+def _image(png: np.ndarray) -> np.ndarray:
+    image = cv2.imdecode(png, cv2.IMREAD_COLOR)
+    assert image is not None
+    return image
 
 
 def make_cache(
@@ -97,7 +115,7 @@ def shards(images: int) -> int:
 
 
 def _path(folder: Path, index: int) -> Path:
-    return folder / f"images-{index:05d}.safetensors"
+    return folder / f"samples-{index:05d}.safetensors"
 
 
 def _prepare() -> None:
@@ -114,19 +132,21 @@ def _make(folder: Path, config: TrainingConfig, index: int) -> None:
         if path not in _ROBOTS:
             _ROBOTS[path] = Robot.load(path)
     generator = SurfaceGenerator([_ROBOTS[path] for path in config.robots], config.images, (config.seed, 2, index))
-    parts: list[bytes] = []
+    parts = [_png(generator.scene(number)) for number in range(SCENES)]
     for number in range(SHARD):
-        samples = generator.samples(number, PRIORS)
-        parts += _encoded(samples)
+        parts += _encoded(generator.samples(number, PRIORS))
     offsets = np.cumsum([0, *map(len, parts)])
     tensors = {
-        "samples": torch.frombuffer(bytearray(b"".join(parts)), dtype=torch.uint8),
+        "images": torch.frombuffer(bytearray(b"".join(parts)), dtype=torch.uint8),
         "offsets": torch.from_numpy(offsets),
     }
     write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, {}))
 
 
 def _encoded(samples: list[SurfaceSample]) -> list[bytes]:
-    image = cv2.imencode(".png", samples[0].observed, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
     maps = [samples[0].surface, *(sample.given for sample in samples)]
-    return [image, *(zlib.compress(np.ascontiguousarray(each).tobytes(), 1) for each in maps)]
+    return [_png(samples[0].observed), *(zlib.compress(np.ascontiguousarray(each).tobytes(), 1) for each in maps)]
+
+
+def _png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()

@@ -21,6 +21,7 @@ SMALL = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4))
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "SHARD", 4)
+    monkeypatch.setattr(cache, "SCENES", 3)
 
 
 def config(folder: Path, **changes) -> TrainingConfig:
@@ -44,16 +45,18 @@ def test_a_cache_holds_what_the_generator_makes_and_is_made_once(tmp_path: Path,
                 kept.sample(number, prior), (sample.observed, sample.surface, sample.given), strict=True
             ):
                 np.testing.assert_array_equal(stored, made)
+    assert kept.scenes == 6
+    np.testing.assert_array_equal(kept.scene(5), generator.scene(2))
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    (tmp_path / "images-00001.safetensors").unlink()
+    (tmp_path / "samples-00001.safetensors").unlink()
     make_cache(tmp_path, settings)
     after = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert after.keys() == before.keys() and sum(after[path] != before[path] for path in after) == 1
 
 
 def test_a_damaged_shard_is_named_with_the_remedy(tmp_path: Path):
-    (tmp_path / "images-00000.safetensors").write_bytes(b"half a file")
-    with pytest.raises(WeightsError, match=r"images-00000.* cannot be read .*Delete the file"):
+    (tmp_path / "samples-00000.safetensors").write_bytes(b"half a file")
+    with pytest.raises(WeightsError, match=r"samples-00000.* cannot be read .*Delete the file"):
         ImageCache(tmp_path, 1)
 
 
