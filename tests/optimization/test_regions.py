@@ -9,10 +9,13 @@ from perfect_predictor import PerfectPredictor
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import SequenceOptimizer, Verdict
 from carts_core.optimization.factors import Prior
 from carts_core.optimization.regions import Alignment, ColourModel, RegionFactor, RegionImages, align_regions
 from carts_core.optimization.sequence_frame import SequenceFrameSolver
 from carts_core.optimization.variables import Variables
+from carts_core.optimization.verdict import Evidence
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
@@ -90,3 +93,28 @@ def test_no_colours_are_learnt_from_a_missing_image(sample: Sequence) -> None:
     variables = Variables(sample.scene, sample.scene.state(frame.truth or {}), FreeParameters(), SETTINGS.length_scale)
     found = solver.colours(frame, variables, np.zeros(len(variables)))
     assert found is not None and found.counts.sum() == 0
+
+
+@pytest.mark.parametrize("convincing", [True, False])
+def test_routine_frames_get_verdicts_of_good_neighbours(monkeypatch: pytest.MonkeyPatch, convincing: bool) -> None:
+    shipped, model, assessed = Sequence.open(sample_sequence()), SequenceSettings(look_every=2, assess_every=4), []
+    usual = SequenceFrameSolver.evidence
+
+    def evidence(self: SequenceFrameSolver, frame: Frame, *arguments) -> Evidence:
+        assessed.append(frame.index)
+        found = usual(self, frame, *arguments)
+        return found if convincing or frame.index else replace(found, loss=1.0)
+
+    monkeypatch.setattr(SequenceFrameSolver, "evidence", evidence)
+    optimizer = SequenceOptimizer(
+        shipped.scene, shipped.frame, dict.fromkeys(range(12)), FeatureExtractor.load(), model=model
+    )
+    list(optimizer)
+    looked = [index for index, visit in sorted(optimizer._visits.items()) if not visit.measurement.by_colours]
+    assert len(looked) > 5 and all(estimate.assessment for estimate in optimizer.estimates.values())
+    if convincing:
+        assert set(assessed) < set(looked) and np.diff(sorted(assessed)).max() <= 5
+        assert all(estimate.assessment.verdict is Verdict.GOOD for estimate in optimizer.estimates.values())
+    else:
+        # The neighbours of the first, failed frame are assessed themselves.
+        assert {0, 1, 2} <= set(assessed)
