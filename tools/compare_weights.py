@@ -23,7 +23,8 @@ from carts_core.files import append_line, output_path
 from carts_core.lab.synthesis import synthesize
 from carts_core.model.instruments.builtin import SCHEME, builtin_names
 from carts_core.model.instruments.catalogue import SI_SUFFIX
-from carts_core.networks.extractor import FeatureExtractor, OnnxSurface
+from carts_core.networks.engines import OnnxSurface
+from carts_core.networks.extractor import FeatureExtractor
 from carts_core.networks.weights import read_weights
 from carts_core.optimization import FreeParameters
 from carts_core.recording import Sequence
@@ -111,7 +112,7 @@ def measure_time(args: argparse.Namespace) -> None:
     networks = {}
     for path in (shipped_weights()[1], *args.weights):
         weights = read_weights(path)
-        networks[str(path)] = OnnxSurface(weights.network.folded(), weights.sha256)  # pyright: ignore[reportArgumentType]
+        networks[str(path)] = OnnxSurface.float32(weights.network.folded(), weights.sha256)  # pyright: ignore[reportArgumentType]
     images, given = torch.rand(1, 3, *_SIZE), torch.rand(1, 6, *_SIZE)
     seconds: dict[str, list[float]] = {name: [] for name in networks}
     for _ in range(_ROUNDS):

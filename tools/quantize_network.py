@@ -37,7 +37,7 @@ class _Images(CalibrationDataReader):
         settings = ImageSettings(width=320, height=240, field_width=320, blood=0.2, enlarged=0.3)
         self._generator, self._made = SurfaceGenerator(robots, settings, _SEED), 0
 
-    def get_next(self) -> dict[str, np.ndarray] | None:
+    def get_next(self) -> dict[str, np.ndarray] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Inputs of the network; None after the last image."""
         if self._made == _IMAGES:
             return None

@@ -85,4 +85,4 @@ def write(key: str, meshes: tuple[LinkMesh, ...], decimation: Decimation) -> Non
         for field in ("link", "vertices", "normals", "faces", "color", "closed"):
             arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))
     with suppress(OutputError), output_stream(output_path(cache_dir(), f"{key}.npz")) as stream:
-        np.savez(stream, **arrays)
+        np.savez(stream, **arrays)  # pyright: ignore[reportArgumentType]

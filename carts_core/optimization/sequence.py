@@ -306,12 +306,13 @@ class SequenceOptimizer:
         """Assess all estimates, then solve failed frames individually if there are no keyframes and only joints are
         free; yield each new estimate."""
         failed, corrections = [], self._smoother.smoothed()
-        alone = self._assessed_alone()
+        anchors = self._anchors()
+        individually = set(anchors)
         known: dict[int, Assessment] = {}
         # The other frames come last, since their verdicts depend on these frames.
-        for index in sorted(self._visits, key=lambda index: index not in alone):
+        for index in sorted(self._visits, key=lambda index: index not in individually):
             began, estimate = time.perf_counter(), self.estimates[index]
-            found = None if index in alone else self._between_good_frames(index, alone, known)
+            found = None if index in individually else self._between_good_frames(index, anchors, known)
             if found is None:
                 frame, variables = self._open(index)
                 found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
@@ -337,7 +338,7 @@ class SequenceOptimizer:
             if in_vain == _IN_VAIN:
                 return
 
-    def _assessed_alone(self) -> list[int]:
+    def _anchors(self) -> list[int]:
         """Frames that get their own verdict: those that needed the network, and a few routine ones."""
         chosen, since = [], self.model.assess_every
         for index in sorted(self._visits):
@@ -348,11 +349,11 @@ class SequenceOptimizer:
         return chosen
 
     def _between_good_frames(
-        self, index: int, alone: Sequence[int], known: Mapping[int, Assessment]
+        self, index: int, anchors: Sequence[int], known: Mapping[int, Assessment]
     ) -> Assessment | None:
         """The less certain one of the verdicts before and after a frame, if both are good; None otherwise."""
-        place = bisect(alone, index)
-        beside = [known[other] for other in alone[max(place - 1, 0) : place + 1]]
+        place = bisect(anchors, index)
+        beside = [known[other] for other in anchors[max(place - 1, 0) : place + 1]]
         if not beside or any(one.verdict is not Verdict.GOOD for one in beside):
             return None
         return max(beside, key=lambda one: one.probability)

@@ -73,7 +73,7 @@ class ImageCache:
         part, *maps = self._parts(shard, [first, first + 1, first + 2 + prior])
         image = _image(part)
         shape = *image.shape[:2], SURFACE_CHANNELS
-        truth, given = (np.frombuffer(zlib.decompress(each), np.int8).reshape(shape) for each in maps)
+        truth, given = (np.frombuffer(zlib.decompress(each.tobytes()), np.int8).reshape(shape) for each in maps)
         return image, truth, given
 
     def _parts(self, shard: int, numbers: list[int]) -> list[np.ndarray]:
