@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from processes import command as of_process
@@ -79,7 +80,7 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
         steps = json.loads(path.read_text())["steps"]
         assert list(steps) == ["optimize", "findings", "export"] or list(steps) == ["optimize", "export", "findings"]
         assert all(0.0 <= step["processor"] and 0.0 <= step["seconds"] for step in steps.values())
-    assert (batch / "inference.txt").read_text() in ("torch", "onnx")
+    assert (batch / "inference.txt").read_text() in get_args(Engine)
     for domain in ("regular", "dark"):
         plain = tmp_path / "plain" / domain
         chosen = ["--domain", domain, "--frames", "001"]
@@ -161,7 +162,7 @@ def test_a_job_is_done_again_when_its_recording_or_its_options_change(sequence: 
     assert statuses() == ["done", "known"]
 
 
-@pytest.mark.parametrize("engine", ["torch", "onnx"])
+@pytest.mark.parametrize("engine", get_args(Engine))
 def test_every_step_that_runs_the_network_knows_with_what(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Engine
 ) -> None:
