@@ -79,7 +79,8 @@ class FeatureExtractor:
         """Fingerprint of the networks and of the inference engine, because the predictions of engines differ."""
         if self._faster is None:
             return self.sha256
-        return f"{self.sha256} {self.engine} {self._faster.digest[:16] if self.engine == 'int8' else ''}".rstrip()
+        graph = f" {self._faster.digest[:16]}" if self.engine == "int8" else ""
+        return f"{self.sha256} {self.engine}{graph}"
 
     @staticmethod
     def load(

@@ -18,7 +18,7 @@ from carts_core.networks import FeatureExtractor
 from carts_core.networks.engines import TOLERANCE
 from carts_core.networks.surface import UNetSurface
 from carts_core.networks.weights import save_weights
-from carts_core.onnx_runtime import exact_int8, inference_session
+from carts_core.onnx_runtime import exact_int8
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
@@ -117,6 +117,9 @@ def test_the_fastest_engine_is_measured_once_and_remembered(
     cache: Path, monkeypatch: pytest.MonkeyPatch, onnx: float, int8: float, engine: str
 ) -> None:
     seconds = {"torch": 1.0, "onnx": onnx, "int8": int8}
+    # On processors where sums of 8-bit products saturate, the quantized network would not be measured.
+    monkeypatch.setattr("carts_core.networks.engines.exact_int8", lambda: True)
+    monkeypatch.setattr("carts_core.networks.engines._deviation", lambda network, other: 0.0)
     monkeypatch.setattr("carts_core.networks.engines._times", lambda network, engines: seconds)
     assert FeatureExtractor.load(inference="auto").engine == engine
     (remembered,) = cache.glob("inference-*.json")
@@ -125,6 +128,7 @@ def test_the_fastest_engine_is_measured_once_and_remembered(
     assert FeatureExtractor.load(inference="auto").engine == engine
 
 
+@pytest.mark.skipif(not exact_int8(), reason="sums of 8-bit products saturate on this processor")
 def test_the_quantized_network_predicts_nearly_what_torch_predicts() -> None:
     sequence = Sequence.open(sample_sequence())
     scene = sequence.scene
@@ -151,16 +155,17 @@ def test_where_sums_of_8_bit_products_saturate_the_network_is_not_quantized(monk
             pairs = a[:, None, ::2] * b.T[None, :, ::2] + a[:, None, 1::2] * b.T[None, :, 1::2]
             return [pairs.clip(-(2**15), 2**15 - 1).sum(2).astype(np.int32)]
 
-    assert exact_int8() in (True, False)
     monkeypatch.setattr("carts_core.onnx_runtime.inference_session", lambda *_: Saturating())
     assert not exact_int8()
-    monkeypatch.setattr("carts_core.networks.engines.inference_session", inference_session)
     assert FeatureExtractor.load(inference="auto").engine in ("torch", "onnx")
     with pytest.raises(SettingsError, match="cannot be used: sums of 8-bit products saturate on this processor"):
         FeatureExtractor.load(inference="int8")
 
 
-def test_weights_without_a_quantized_graph_are_refused_or_run_in_another_engine(weights: Path) -> None:
+def test_weights_without_a_quantized_graph_are_refused_or_run_in_another_engine(
+    weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carts_core.networks.engines.exact_int8", lambda: True)
     with pytest.raises(SettingsError, match="cannot be used: only the shipped weights have a quantized graph"):
         FeatureExtractor.load(weights, inference="int8")
     assert FeatureExtractor.load(weights, inference="auto").engine in ("torch", "onnx")

@@ -34,9 +34,9 @@ _VARIANTS = 12
 _VARIANT_LIFE = 80
 """Number of images after which the next entry of the pool is renewed."""
 _OBSERVATIONS, _SCENES, _EMPTY = 0, 1, 2
-_TISSUE = 0.6
-"""Minimum share of tissue among scenes without arms, which are generated for more variety behind the arms."""
 """Indices of the random streams."""
+_TISSUE = 0.6
+"""Minimum share of tissue among scenes without arms."""
 _TRIES = 12
 _FAR = 100.0
 """Distance behind the camera at which absent arms are placed [m]."""
