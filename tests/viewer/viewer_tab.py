@@ -99,8 +99,9 @@ def widget(app: ViewerApp, raw: RawTab, label: str) -> Any:
 
 
 def dismiss_warning(page: Page) -> None:
-    """Close viser's warning that this browser has no graphics card, without waiting for its animation."""
+    """Close viser's warning that this browser has no graphics card; until it is gone, it lies above the sliders."""
     page.locator(".mantine-Notification-closeButton").first.dispatch_event("click")
+    page.locator(".mantine-Notification-root").first.wait_for(state="detached")
 
 
 def press(locator: Locator, timeout: float | None = None) -> None:
