@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from ...errors import CartsError, SequenceError
@@ -52,6 +53,10 @@ _NOMINAL = {0: (0.0, 0.0, -0.009), 6: (0.0, 0.0, -0.009)}
 """Dot -> approximate position in its link's frame [m]; other dots are near the origins of their links."""
 _DOT_M, _DOT_PX = 0.003, 5.0
 """Standard deviations of approximate positions [m], and of keypoints predicted from measured joints [px]."""
+_KEYPOINT_PX = 2.0
+"""Standard deviation of published keypoints [px]."""
+_JOINT_STD = {"revolute": 0.02, "prismatic": 0.001}
+"""Standard deviations of measured joints [rad, m]."""
 _NEAREST = 1e-3
 """Minimum depth in projections [m]."""
 
@@ -234,11 +239,15 @@ class _Projection:
 
     def __init__(self, sequence: Sequence, arm: Arm, points: Several[Keypoint], joints: Float[np.ndarray, "n dofs"]):
         cameras = {camera.name: camera for camera in sequence.scene.cameras}
-        self.links = [arm.robot.link_names.index(_LINKS[point.dot]) for point in points]
-        self.Ts_base_link = arm.robot.forward_kinematics(joints)[np.arange(len(points)), self.links]
+        self._robot, self._links = arm.robot, [arm.robot.link_names.index(_LINKS[point.dot]) for point in points]
+        self.move(joints)
         self.Ts_camera_world = np.stack([cameras[point.camera].T_camera_world for point in points])
         self.intrinsics = np.array([cameras[point.camera].intrinsics for point in points])
         self.pixels = np.array([point.pixel for point in points])
+
+    def move(self, joints: Float[np.ndarray, "n dofs"]) -> None:
+        """Set the joint positions at each keypoint [rad, m]."""
+        self.Ts_base_link = self._robot.forward_kinematics(joints)[np.arange(len(joints)), self._links]
 
     def distances(
         self, T_world_base: Float[np.ndarray, "4 4"], positions: Float[np.ndarray, "n 3"]
@@ -250,44 +259,55 @@ class _Projection:
         return self.intrinsics[:, :2] * seen[:, :2] / depth + self.intrinsics[:, 2:] - self.pixels
 
 
-def _robust(distances: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " m"]:
+def _robust(distances: Float[np.ndarray, "n 2"], deviation: float) -> Float[np.ndarray, " m"]:
     """Residuals whose squares grow linearly for outliers (soft L1)."""
-    scaled = np.linalg.norm(distances, axis=1, keepdims=True) / _DOT_PX
-    return (distances / _DOT_PX * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + scaled**2)))).ravel()
+    scaled = np.linalg.norm(distances, axis=1, keepdims=True) / deviation
+    return (distances / deviation * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + scaled**2)))).ravel()
 
 
 def hand_eye(
     sequence: Sequence, arm: Arm, keypoints: Several[Keypoint]
 ) -> tuple[Float[np.ndarray, "4 4"], float] | None:
-    """Base frame `T_world_base` of an arm, and RMS residual [px]; None for too few keypoints.
+    """Base frame `T_world_base` of an arm, and RMS residual at the measured joints [px]; None for too few keypoints.
 
-    The positions of the dots on their links are also estimated, from approximate initial values.
+    The errors of the measured joints in each frame and the positions of the dots on their links are also estimated,
+    from zero and from approximate values. Without the errors of joints, those of the base frame were four times larger.
     """
     frames = sorted({point.frame for point in keypoints})
-    chosen = {frames[index] for index in evenly_spaced(len(frames), min(_CALIBRATION_FRAMES, len(frames)))}
+    chosen = [frames[index] for index in evenly_spaced(len(frames), min(_CALIBRATION_FRAMES, len(frames)))]
     points = [point for point in keypoints if point.frame in chosen]
     first = sequence.scene.cameras[0]
     own = np.array([point.camera == first.name for point in points])
     if own.sum() < _MIN_DOTS:
         return None
-    joints = np.asarray(sequence.measured[arm.name])[[point.frame for point in points]]
-    projection = _Projection(sequence, arm, points, joints)
+    measured = np.asarray(sequence.measured[arm.name])[chosen]
+    of_frame = np.array([chosen.index(point.frame) for point in points])
+    projection = _Projection(sequence, arm, points, measured[of_frame])
     dots = sorted({point.dot for point in points})
     rows, nominal = np.array([dots.index(point.dot) for point in points]), _nominal(dots)
+    joint_std = np.array([_JOINT_STD[type_] for type_ in arm.robot.joint_types])
+    errors_from = 6 + 3 * len(dots)
+
+    def distances(x: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        projection.move((measured + joint_std * errors)[of_frame])
+        return projection.distances(_pose(x[:6]), (nominal + _DOT_M * x[6:errors_from].reshape(-1, 3))[rows])
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        offsets = x[6:].reshape(-1, 3)
-        distances = projection.distances(_pose(x[:6]), (nominal + offsets)[rows])
-        return np.concatenate([_robust(distances), x[6:] / _DOT_M])
+        return np.concatenate([_robust(distances(x, x[errors_from:].reshape(measured.shape)), _KEYPOINT_PX), x[6:]])
 
     p_base = (projection.Ts_base_link @ np.c_[nominal[rows], np.ones(len(rows))][..., None])[:, :3, 0]
     K = opencv_matrix(first.intrinsics)
     _, turn, shift = cv2.solvePnP(p_base[own], projection.pixels[own] - HALF_PIXEL, K, None, flags=cv2.SOLVEPNP_SQPNP)
     T = np.linalg.inv(first.T_camera_world) @ _pose(np.concatenate([turn.ravel(), shift.ravel()]))
-    start = [*Rotation.from_matrix(T[:3, :3]).as_rotvec(), *T[:3, 3], *[0.0] * (3 * len(dots))]
-    fit = least_squares(residuals, start, x_scale="jac")
-    distances = projection.distances(_pose(fit.x[:6]), (nominal + fit.x[6:].reshape(-1, 3))[rows])
-    return _pose(fit.x[:6]), float(np.sqrt(np.square(distances).sum(1).mean()))
+    start = np.zeros(errors_from + measured.size)
+    start[:6] = *Rotation.from_matrix(T[:3, :3]).as_rotvec(), *T[:3, 3]
+    # A keypoint depends on the errors of its own frame only.
+    own_errors = np.repeat(np.eye(len(chosen))[of_frame], measured.shape[1], axis=1)
+    of_points = np.concatenate([np.ones((len(points), errors_from)), own_errors], 1)
+    sparsity = csr_array(np.concatenate([np.repeat(of_points, 2, axis=0), np.eye(len(start))[6:]]))
+    fit = least_squares(residuals, start, x_scale="jac", jac_sparsity=sparsity)
+    remaining = distances(fit.x, np.zeros_like(measured))
+    return _pose(fit.x[:6]), float(np.sqrt(np.square(remaining).sum(1).mean()))
 
 
 def _nominal(dots: Several[int]) -> Float[np.ndarray, "dots 3"]:
@@ -308,7 +328,7 @@ def _dots(
 
         def residuals(x: np.ndarray, projection: _Projection = projection, nominal: np.ndarray = nominal) -> np.ndarray:
             distances = projection.distances(arm.T_world_base, np.tile(x, (len(projection.pixels), 1)))
-            return np.concatenate([_robust(distances), (x - nominal) / _DOT_M])
+            return np.concatenate([_robust(distances, _DOT_PX), (x - nominal) / _DOT_M])
 
         found[dot] = least_squares(residuals, nominal, x_scale=_DOT_M).x
     return found

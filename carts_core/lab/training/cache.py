@@ -1,23 +1,27 @@
 """Training images of the surface network on disk, generated once by several processes and read in random order.
 
 A shard is a safetensors file of images of scenes without arms (PNG), and of compressed samples: an image (PNG), its
-true surface map, and several prior surface maps from different kinematic errors.
+true surface map, and several prior surface maps from different kinematic errors. It states the robots and the image
+settings from which it was generated.
 """
 
+import json
 import multiprocessing
 import os
 import zlib
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 
-from ...errors import WeightsError
+from ...errors import SettingsError, WeightsError
 from ...files import output_path, write_bytes
 from ...model.parts import SURFACE_CHANNELS
 from ...model.robot import Robot
@@ -44,13 +48,7 @@ class ImageCache:
     def __init__(self, folder: Path, shards: int) -> None:
         self._files = []
         for index in range(shards):
-            path = _path(folder, index)
-            try:
-                self._files.append(safe_open(path, framework="pt"))
-            except (SafetensorError, OSError) as error:
-                raise WeightsError(
-                    f"shard {path} cannot be read ({error}). Delete the file to generate it again."
-                ) from error
+            self._files.append(_opened(_path(folder, index)))
         self._offsets = [file.get_tensor("offsets").numpy() for file in self._files]
 
     def __len__(self) -> int:
@@ -94,9 +92,22 @@ def make_cache(
 
     Args:
         progress: called with the number of finished images and the total.
+
+    Raises:
+        SettingsError: a shard was generated for other robots or image settings.
+        WeightsError: a shard cannot be read.
     """
     wanted = shards(config.cached)
-    missing = [index for index in range(wanted) if not _path(folder, index).exists()]
+    missing = []
+    for index in range(wanted):
+        path = _path(folder, index)
+        if not path.exists():
+            missing.append(index)
+        elif _opened(path).metadata() != _settings(config):
+            raise SettingsError(
+                f"shard {path} was generated for other robots or image settings. Give another cache folder, or delete "
+                "the shards of this one."
+            )
     progress((wanted - len(missing)) * SHARD, wanted * SHARD)
     make = partial(_make, folder, config)
     with ExitStack() as stack:
@@ -112,6 +123,18 @@ def make_cache(
 def shards(images: int) -> int:
     """Number of shards for a number of images."""
     return -(-images // SHARD)
+
+
+def _opened(path: Path) -> Any:
+    try:
+        return safe_open(path, framework="pt")
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"shard {path} cannot be read ({error}). Delete the file to generate it again.") from error
+
+
+def _settings(config: TrainingConfig) -> dict[str, str]:
+    settings = {"robots": [str(path) for path in config.robots], "images": asdict(config.images)}
+    return {"settings": json.dumps(settings, default=str)}
 
 
 def _path(folder: Path, index: int) -> Path:
@@ -140,7 +163,7 @@ def _make(folder: Path, config: TrainingConfig, index: int) -> None:
         "images": torch.frombuffer(bytearray(b"".join(parts)), dtype=torch.uint8),
         "offsets": torch.from_numpy(offsets),
     }
-    write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, {}))
+    write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, _settings(config)))
 
 
 def _encoded(samples: list[SurfaceSample]) -> list[bytes]:

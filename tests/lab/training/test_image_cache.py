@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,14 @@ def test_a_damaged_shard_is_named_with_the_remedy(tmp_path: Path):
     (tmp_path / "samples-00000.safetensors").write_bytes(b"half a file")
     with pytest.raises(WeightsError, match=r"samples-00000.* cannot be read .*Delete the file"):
         ImageCache(tmp_path, 1)
+
+
+def test_a_cache_of_other_settings_is_refused(tmp_path: Path):
+    settings = config(tmp_path)
+    make_cache(tmp_path, settings)
+    make_cache(tmp_path, replace(settings, steps=13, seed=1))
+    with pytest.raises(SettingsError, match=r"samples-00000.* other robots or image settings. Give another cache"):
+        make_cache(tmp_path, replace(settings, images=replace(settings.images, blood=0.5)))
 
 
 def test_a_surface_network_learns_from_a_cache_and_goes_on_with_the_same_batches(tmp_path: Path):
