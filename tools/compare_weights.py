@@ -1,16 +1,20 @@
-"""Compare surface networks by the fits they give on synthetic sequences of the built-in instruments.
+"""Compare surface networks by the fits they give on synthetic sequences of the built-in instruments and on recordings.
 
     python -m tools.compare_weights run RESULTS.jsonl --weights runs/new/surface.safetensors --robots cautery_hook
+    python -m tools.compare_weights run RESULTS.jsonl --weights runs/new/surface.safetensors --robots \
+        --recordings sample_data/sequence/sequence.toml
     python -m tools.compare_weights report RESULTS.jsonl
     python -m tools.compare_weights time runs/new/surface.safetensors
 
-Weights are compared with the shipped weights, named `shipped`. `run` renders missing sequences and resumes where it was
-stopped. `time` measures the inference time of one image with one thread of ONNX Runtime, all networks in turn.
+Weights are compared with the shipped weights, named `shipped`, all in single precision. `run` renders missing sequences
+and resumes where it was stopped; of recordings, frames with a mask are fitted in the first camera and in all domains.
+`time` measures the inference time of one image with one thread of ONNX Runtime, all networks in turn.
 """
 
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
@@ -27,7 +31,7 @@ from carts_core.networks.engines import OnnxSurface
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.networks.weights import read_weights
 from carts_core.optimization import FreeParameters
-from carts_core.recording import Sequence
+from carts_core.recording import Sequence, evenly_spaced
 from carts_core.resources import shipped_weights
 from carts_core.settings import SurfaceSolver
 from carts_core.settings.synthesis import MotionConfig, RenderConfig, SynthesisConfig
@@ -52,31 +56,42 @@ def _sequence(folder: Path, robot: str, frames: int) -> Sequence:
 
 
 def _key(row: dict) -> tuple:
-    return row["weights"], row["robot"], row["domain"], row["degrees"], row["index"]
+    return row["weights"], row["name"], row["domain"], row["degrees"], row["index"]
+
+
+def _compared(args: argparse.Namespace) -> Iterator[tuple[str, Sequence, tuple[str, ...], list[int]]]:
+    """Name, sequence, domains and frames of each fitted sequence."""
+    for robot in args.robots:
+        yield robot, _sequence(args.sequences, robot, args.frames), DOMAINS, list(range(args.frames))
+    for path in args.recordings:
+        sequence = Sequence.open(path)
+        camera = sequence.scene.cameras[0].name
+        masked = [index for index in range(len(sequence)) if sequence.frame(index, cameras=[camera]).masks]
+        frames = [masked[place] for place in evenly_spaced(len(masked), min(args.frames, len(masked)))]
+        yield sequence.name, sequence, sequence.domains, frames
 
 
 def run(args: argparse.Namespace) -> None:
     """Append the missing scores to the results."""
     torch.set_num_threads(1)
     done = {_key(row) for row in _rows(args.results)} if args.results.exists() else set()
-    loaded = {str(path): FeatureExtractor.load(path, inference="auto") for path in args.weights}
-    extractors = {_SHIPPED: FeatureExtractor.load(inference="auto"), **loaded}
-    for robot in args.robots:
-        sequence = _sequence(args.sequences, robot, args.frames)
-        for degrees, domain, (name, extractor) in product(args.degrees, DOMAINS, extractors.items()):
-            wanted = [i for i in range(args.frames) if (name, robot, domain, degrees, i) not in done]
+    loaded = {str(path): FeatureExtractor.load(path, inference="onnx") for path in args.weights}
+    extractors = {_SHIPPED: FeatureExtractor.load(inference="onnx"), **loaded}
+    for sequence_name, sequence, domains, frames in _compared(args):
+        for degrees, domain, (name, extractor) in product(args.degrees, domains, extractors.items()):
+            wanted = [index for index in frames if (name, sequence_name, domain, degrees, index) not in done]
             scores = evaluate(
                 sequence,
                 extractor,
                 frames=wanted,
-                cameras=["left"],
+                cameras=[sequence.scene.cameras[0].name],
                 domains=[domain],
                 settings=SurfaceSolver(),
                 free=FreeParameters(),
                 perturb_deg=degrees,
             )
             for index, score in zip(wanted, scores, strict=True):
-                row = {"weights": name, "robot": robot, "degrees": degrees, "index": index, **asdict(score)}
+                row = {"weights": name, "name": sequence_name, "degrees": degrees, "index": index, **asdict(score)}
                 append_line(args.results, json.dumps(row).encode())
 
 
@@ -93,10 +108,10 @@ def report(args: argparse.Namespace) -> None:
         keys = [(name, *rest) for name in networks]
         if all(key in scores for key in keys):
             rows.setdefault((rest[0], rest[1], rest[2]), []).append([scores[key] for key in keys])
-    print("| instrument, domain, initial error | frames | " + " | ".join(networks) + " |")
+    print("| sequence, domain, initial error | frames | " + " | ".join(networks) + " |")
     print("|---|---|" + len(networks) * "---|")
-    for (robot, domain, degrees), found in rows.items():
-        print(f"| {robot}, {domain}, {degrees:g}° | {len(found)} | {_cells(found)} |")
+    for (name, domain, degrees), found in rows.items():
+        print(f"| {name}, {domain}, {degrees:g}° | {len(found)} | {_cells(found)} |")
     everything = [values for found in rows.values() for values in found]
     print(f"| all | {len(everything)} | {_cells(everything)} |")
 
@@ -135,6 +150,7 @@ def main() -> None:
     fits.add_argument(
         "--robots", nargs="*", default=robots, help="built-in instruments; by default all on a classic arm"
     )
+    fits.add_argument("--recordings", type=Path, nargs="*", default=[], help="sequence files with masks")
     fits.add_argument("--sequences", type=Path, default=Path("runs/sequences"), help="folder of rendered sequences")
     fits.add_argument("--frames", type=int, default=8, help="frames of each sequence")
     fits.add_argument("--degrees", type=float, nargs="*", default=[2.0, 5.0], help="initial errors [deg]")
