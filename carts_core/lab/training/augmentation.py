@@ -23,6 +23,10 @@ _ELSEWHERE, _ABSENT = 0.42, 0.12
 _PASTED, _WARPED, _MOVED, _OMITTED = 0.35, 0.5, 0.45, 0.12
 """Shares of samples with arms of a second image, a rotated and enlarged image, a prior that is moved further, and no
 prior."""
+_SHADOWED, _SHADOW = 0.6, (0.1, 0.7)
+"""Share of pasted arms that cast a shadow, and range of its darkness [1]."""
+_SHADOW_SHIFT, _SHADOW_BLUR = 9.0, (0.8, 9.0)
+"""Standard deviation of the shift and range of the blur of such shadows [px]."""
 _ROTATION, _ZOOM = 20.0, (0.95, 1.45)
 """Maximum rotation [deg] and range of the scale [1] of images."""
 _ANYWHERE = 0.5
@@ -61,7 +65,8 @@ def randomized(rng: np.random.Generator, cache: ImageCache, number: int, size: t
     """
     sample = _drawn(rng, cache, number)
     if rng.random() < _PASTED:
-        sample = pasted(_drawn(rng, cache, int(rng.integers(len(cache)))), sample)
+        front = _drawn(rng, cache, int(rng.integers(len(cache))))
+        sample = pasted(front, shaded(rng, sample, front.surface))
     if rng.random() < _OMITTED:
         sample = replace(sample, given=np.zeros_like(sample.given))
     elif rng.random() < _MOVED:
@@ -98,7 +103,7 @@ def _drawn(rng: np.random.Generator, cache: ImageCache, number: int) -> SurfaceS
     scene, nothing = augmented(rng, cache.scene(int(rng.integers(cache.scenes)))), np.zeros_like(truth)
     if chance < _ABSENT:
         return SurfaceSample(scene, given, nothing)
-    return pasted(sample, SurfaceSample(scene, nothing, nothing))
+    return pasted(sample, shaded(rng, SurfaceSample(scene, nothing, nothing), truth))
 
 
 def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:
@@ -110,6 +115,17 @@ def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:
         for ahead, behind in ((front.given, back.given), (front.surface, back.surface))
     )
     return SurfaceSample((observed + 0.5).astype(np.uint8), given, surface)
+
+
+def shaded(rng: np.random.Generator, sample: SurfaceSample, surface: np.ndarray) -> SurfaceSample:
+    """Image that sometimes has a shadow of the arms of a surface map: their silhouette, shifted and blurred."""
+    if rng.random() >= _SHADOWED:
+        return sample
+    A = np.column_stack([np.eye(2), rng.normal(0, _SHADOW_SHIFT, 2)])
+    shadow = cv2.warpAffine(_cover(surface), A, surface.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+    blurred = cv2.GaussianBlur(shadow, (0, 0), np.exp(rng.uniform(*np.log(_SHADOW_BLUR))))
+    light = 1 - np.float32(rng.uniform(*_SHADOW)) * blurred[..., None]
+    return replace(sample, observed=(sample.observed * light + np.float32(0.5)).astype(np.uint8))
 
 
 def _cover(surface: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import SurfaceGenerator, SurfaceSample
 from carts_core.lab.training import cache
-from carts_core.lab.training.augmentation import augmented, pasted, randomized, warped_map
+from carts_core.lab.training.augmentation import augmented, pasted, randomized, shaded, warped_map
 from carts_core.lab.training.cache import ImageCache, make_cache
 from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.training import train
@@ -117,6 +117,21 @@ def test_pasted_arms_hide_those_behind():
     for surface in (both.given, both.surface):
         assert (surface[:4, :, 0] == 127).all() and (surface[:4, :, 1] == 0).all() and (surface[4:6, :, 1] == 127).all()
         assert not surface[6:].any()
+
+
+def test_pasted_arms_sometimes_cast_a_grey_shadow_near_them():
+    surface = np.zeros((160, 80, 6), np.int8)
+    surface[60:80, :, 0] = 127
+    nothing = np.zeros_like(surface)
+    scene = SurfaceSample(np.full((160, 80, 3), 200, np.uint8), nothing, nothing)
+    dark = []
+    for seed in range(40):
+        image = shaded(np.random.default_rng(seed), scene, surface).observed
+        if image.min() < 190:
+            dark.append(image)
+            assert image.min() >= 200 * 0.3 - 1 and (image[..., :1] == image).all()
+            assert abs(int((200 - image[:, 40, 0].astype(float)).argmax()) - 70) < 50
+    assert 12 < len(dark) < 36
 
 
 def test_crops_are_mostly_around_arms(tmp_path: Path):
