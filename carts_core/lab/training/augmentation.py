@@ -23,10 +23,10 @@ _ELSEWHERE, _ABSENT = 0.42, 0.12
 _PASTED, _WARPED, _MOVED, _OMITTED = 0.35, 0.5, 0.45, 0.12
 """Shares of samples with arms of a second image, a rotated and enlarged image, a prior that is moved further, and no
 prior."""
-_SHADOWED, _SHADOW = 0.6, (0.1, 0.7)
+_SHADOWED, _SHADOW = 0.6, (0.1, 0.95)
 """Share of pasted arms that cast a shadow, and range of its darkness [1]."""
-_SHADOW_SHIFT, _SHADOW_BLUR = 9.0, (0.8, 9.0)
-"""Standard deviation of the shift and range of the blur of such shadows [px]."""
+_SHADOW_SHIFT, _SHADOW_BLUR = (1.5, 25.0), (0.3, 9.0)
+"""Ranges of the shift and of the blur of such shadows [px]. Close, sharp and dark ones resemble a shaft."""
 _ROTATION, _ZOOM = 20.0, (0.95, 1.45)
 """Maximum rotation [deg] and range of the scale [1] of images."""
 _ANYWHERE = 0.5
@@ -121,7 +121,8 @@ def shaded(rng: np.random.Generator, sample: SurfaceSample, surface: np.ndarray)
     """Image that sometimes has a shadow of the arms of a surface map: their silhouette, shifted and blurred."""
     if rng.random() >= _SHADOWED:
         return sample
-    A = np.column_stack([np.eye(2), rng.normal(0, _SHADOW_SHIFT, 2)])
+    shift, heading = np.exp(rng.uniform(*np.log(_SHADOW_SHIFT))), rng.uniform(0, 2 * np.pi)
+    A = np.column_stack([np.eye(2), shift * np.array([np.cos(heading), np.sin(heading)])])
     shadow = cv2.warpAffine(_cover(surface), A, surface.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
     blurred = cv2.GaussianBlur(shadow, (0, 0), np.exp(rng.uniform(*np.log(_SHADOW_BLUR))))
     light = 1 - np.float32(rng.uniform(*_SHADOW)) * blurred[..., None]
