@@ -271,7 +271,7 @@ def hand_eye(
     """Base frame `T_world_base` of an arm, and RMS residual at the measured joints [px]; None for too few keypoints.
 
     The errors of the measured joints in each frame and the positions of the dots on their links are also estimated,
-    from zero and from approximate values. Without the errors of joints, those of the base frame were four times larger.
+    from zero and from approximate values. Otherwise, errors of joints become errors of the base frame.
     """
     frames = sorted({point.frame for point in keypoints})
     chosen = [frames[index] for index in evenly_spaced(len(frames), min(_CALIBRATION_FRAMES, len(frames)))]

@@ -46,9 +46,7 @@ class ImageCache:
     """
 
     def __init__(self, folder: Path, shards: int) -> None:
-        self._files = []
-        for index in range(shards):
-            self._files.append(_opened(_path(folder, index)))
+        self._files = [_opened(_path(folder, index)) for index in range(shards)]
         self._offsets = [file.get_tensor("offsets").numpy() for file in self._files]
 
     def __len__(self) -> int:
@@ -133,8 +131,9 @@ def _opened(path: Path) -> Any:
 
 
 def _settings(config: TrainingConfig) -> dict[str, str]:
-    settings = {"robots": [str(path) for path in config.robots], "images": asdict(config.images)}
-    return {"settings": json.dumps(settings, default=str)}
+    """Metadata of a shard, with only the names of files, so that they can be moved."""
+    settings = {"robots": config.robots, "images": asdict(config.images)}
+    return {"settings": json.dumps(settings, default=lambda path: path.name)}
 
 
 def _path(folder: Path, index: int) -> Path:
