@@ -23,8 +23,8 @@ _ELSEWHERE, _ABSENT = 0.42, 0.12
 _PASTED, _WARPED, _MOVED, _OMITTED = 0.35, 0.5, 0.45, 0.12
 """Shares of samples with arms of a second image, a rotated and enlarged image, a prior that is moved further, and no
 prior."""
-_SHADOWED, _SHADOW = 0.6, (0.1, 0.95)
-"""Share of pasted arms that cast a shadow, and range of its darkness [1]."""
+_SHADOWED, _SHADOW = 0.5, 0.98
+"""Share of images with a further shadow of the arms, and its maximum darkness [1]."""
 _SHADOW_SHIFT, _SHADOW_BLUR = (1.5, 25.0), (0.3, 9.0)
 """Ranges of the shift and of the blur of such shadows [px]. Close, sharp and dark ones resemble a shaft."""
 _ROTATION, _ZOOM = 20.0, (0.95, 1.45)
@@ -63,10 +63,10 @@ def randomized(rng: np.random.Generator, cache: ImageCache, number: int, size: t
     Args:
         size: width and height of the crop [px], at most those of the image.
     """
-    sample = _drawn(rng, cache, number)
+    sample = shaded(rng, _drawn(rng, cache, number))
     if rng.random() < _PASTED:
         front = _drawn(rng, cache, int(rng.integers(len(cache))))
-        sample = pasted(front, shaded(rng, sample, front.surface))
+        sample = pasted(front, shadowed(rng, sample, front.surface))
     if rng.random() < _OMITTED:
         sample = replace(sample, given=np.zeros_like(sample.given))
     elif rng.random() < _MOVED:
@@ -103,7 +103,7 @@ def _drawn(rng: np.random.Generator, cache: ImageCache, number: int) -> SurfaceS
     scene, nothing = augmented(rng, cache.scene(int(rng.integers(cache.scenes)))), np.zeros_like(truth)
     if chance < _ABSENT:
         return SurfaceSample(scene, given, nothing)
-    return pasted(sample, shaded(rng, SurfaceSample(scene, nothing, nothing), truth))
+    return pasted(sample, shadowed(rng, SurfaceSample(scene, nothing, nothing), truth))
 
 
 def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:
@@ -117,7 +117,16 @@ def pasted(front: SurfaceSample, back: SurfaceSample) -> SurfaceSample:
     return SurfaceSample((observed + 0.5).astype(np.uint8), given, surface)
 
 
-def shaded(rng: np.random.Generator, sample: SurfaceSample, surface: np.ndarray) -> SurfaceSample:
+def shaded(rng: np.random.Generator, sample: SurfaceSample) -> SurfaceSample:
+    """Image that sometimes has a further shadow of its own arms, which falls beside them only."""
+    changed, cover = shadowed(rng, sample, sample.surface), _cover(sample.surface)
+    if changed is sample:
+        return sample
+    observed = cover * sample.observed + (1 - cover) * changed.observed
+    return replace(sample, observed=(observed + 0.5).astype(np.uint8))
+
+
+def shadowed(rng: np.random.Generator, sample: SurfaceSample, surface: np.ndarray) -> SurfaceSample:
     """Image that sometimes has a shadow of the arms of a surface map: their silhouette, shifted and blurred."""
     if rng.random() >= _SHADOWED:
         return sample
@@ -125,7 +134,8 @@ def shaded(rng: np.random.Generator, sample: SurfaceSample, surface: np.ndarray)
     A = np.column_stack([np.eye(2), shift * np.array([np.cos(heading), np.sin(heading)])])
     shadow = cv2.warpAffine(_cover(surface), A, surface.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
     blurred = cv2.GaussianBlur(shadow, (0, 0), np.exp(rng.uniform(*np.log(_SHADOW_BLUR))))
-    light = 1 - np.float32(rng.uniform(*_SHADOW)) * blurred[..., None]
+    # Dark ones are more frequent: they are the most similar to a shaft.
+    light = 1 - np.float32(_SHADOW * np.sqrt(rng.random())) * blurred[..., None]
     return replace(sample, observed=(sample.observed * light + np.float32(0.5)).astype(np.uint8))
 
 

@@ -9,7 +9,7 @@ import pytest
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import SurfaceGenerator, SurfaceSample
 from carts_core.lab.training import cache
-from carts_core.lab.training.augmentation import augmented, pasted, randomized, shaded, warped_map
+from carts_core.lab.training.augmentation import augmented, pasted, randomized, shaded, shadowed, warped_map
 from carts_core.lab.training.cache import ImageCache, make_cache
 from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.training import train
@@ -126,12 +126,21 @@ def test_pasted_arms_sometimes_cast_a_grey_shadow_near_them():
     scene = SurfaceSample(np.full((160, 80, 3), 200, np.uint8), nothing, nothing)
     dark = []
     for seed in range(40):
-        image = shaded(np.random.default_rng(seed), scene, surface).observed
+        image = shadowed(np.random.default_rng(seed), scene, surface).observed
         if image.min() < 190:
             dark.append(image)
-            assert image.min() >= 200 * 0.05 - 1 and (image[..., :1] == image).all()
+            assert image.min() >= 200 * 0.02 - 1 and (image[..., :1] == image).all()
             assert abs(int((200 - image[:, 40, 0].astype(float)).argmax()) - 70) < 50
-    assert 12 < len(dark) < 36
+    assert 8 < len(dark) < 32
+
+
+def test_a_further_shadow_of_arms_falls_beside_them_only():
+    surface = np.zeros((160, 80, 6), np.int8)
+    surface[60:80, :, 0] = 127
+    sample = SurfaceSample(np.full((160, 80, 3), 200, np.uint8), surface, surface)
+    images = [shaded(np.random.default_rng(seed), sample).observed for seed in range(40)]
+    assert all((image[60:80] == 200).all() for image in images)
+    assert 8 < sum(image.min() < 190 for image in images) < 36
 
 
 def test_crops_are_mostly_around_arms(tmp_path: Path):
