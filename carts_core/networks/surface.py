@@ -84,6 +84,12 @@ class Encoder(nn.Module):
                 assert module.bias is not None
                 nn.init.zeros_(module.bias)
 
+    def freeze(self, stages: int) -> None:
+        """Exclude the stem and a number of stages from training; 0 excludes nothing."""
+        if stages:
+            self.stem.requires_grad_(False)
+            self.stages[:stages].requires_grad_(False)
+
 
 _LOCAL_CONTRAST, _BLOCK = 0.8, 16
 """Normalization of images, as in the shipped network; see `standardize`."""

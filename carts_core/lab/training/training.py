@@ -171,6 +171,8 @@ class _Run:
     def __init__(self, config: TrainingConfig, output: Path) -> None:
         torch.manual_seed(config.seed)
         self.network = channels_last(_first_network(config).to(config.device))
+        if isinstance(self.network, SurfaceNetwork):
+            self.network.encoder.freeze(config.frozen)
         config = _with_architecture(config, self.network)
         self.config, self.output, self.task = config, output, task_of(config.network)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)

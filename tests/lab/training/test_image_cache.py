@@ -14,6 +14,7 @@ from carts_core.lab.training.cache import ImageCache, make_cache
 from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.training import train
 from carts_core.model.robot import Robot
+from carts_core.networks.weights import read_weights
 from carts_core.settings import ImageSettings, SurfaceArchitecture, TrainingConfig
 
 SMALL = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4))
@@ -79,6 +80,19 @@ def test_a_surface_network_learns_from_a_cache_and_goes_on_with_the_same_batches
             next(first)
         for one, same in zip(next(first), next(later), strict=True):
             assert one.shape[0] == 4 and one.equal(same)
+
+
+def test_frozen_stages_keep_their_weights(tmp_path: Path):
+    settings = config(tmp_path / "images", cached=4, batch_size=2, warmup=1)
+    trained = {}
+    for steps in (1, 3):
+        result = train(replace(settings, steps=steps, frozen=2), tmp_path / f"run{steps}")
+        trained[steps] = read_weights(result.weights).network.state_dict()
+    for name, values in trained[1].items():
+        if name.startswith(("encoder.stem", "encoder.stages.0", "encoder.stages.1")):
+            assert values.equal(trained[3][name])
+        elif name.startswith("encoder"):
+            assert not values.equal(trained[3][name])
 
 
 def test_a_cache_is_refused_for_the_feature_network(tmp_path: Path):
