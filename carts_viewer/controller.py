@@ -268,9 +268,10 @@ class Controller(Handler):
             self._context.change(playing=False)
 
     def leave(self) -> None:
-        """End the run of a closed tab and save its pose. Errors as in `close`."""
+        """End the run and the stream of a closed tab, and save the pose of the run. Errors as in `close`."""
         if self._optimizing.active:
             self._optimizing.end("Stopped: its tab was closed; Run starts from the current pose")
+        self._live.end_soon()
 
     def close(self) -> None:
         """End the stream and save the unfinished gesture.

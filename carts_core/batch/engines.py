@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Literal
+from uuid import uuid4
 
 from ..errors import SettingsError
 from ..stopping import Stopped, end_with_parent, stopped_by_signals
@@ -153,9 +154,16 @@ def _serve(connection: Connection, work: Callable[[Job], Outcome], parent: int) 
                 job = connection.recv()
             except (EOFError, OSError):
                 return
-            outcome = work(job)
+            try:
+                outcome = work(job)
+            except Exception as error:  # Such as a full disk, on which the state of the job could not be written.
+                outcome = _raised(job, error)
             with suppress(OSError):
                 connection.send(outcome)
+
+
+def _raised(job: Job, error: BaseException) -> Outcome:
+    return Outcome(job.name, "failed", f"{type(error).__name__}: {error}")
 
 
 LOCAL = "local"
@@ -203,13 +211,15 @@ class Cluster:
                     "scheduler`, and workers with `dask worker ADDRESS --nthreads 1`, or use `local`."
                 ) from error
             self.workers = sum(client.nthreads().values()) or self.workers  # pyright: ignore
-            futures = {client.submit(self._work, job, key=f"carts-{job.name}", pure=False): job for job in jobs}
+            # Batches of the same scheduler may have jobs of equal names.
+            batch = uuid4().hex
+            futures = {client.submit(self._work, job, key=f"carts-{batch}-{job.name}", pure=False): job for job in jobs}
             for future in as_completed(futures):
                 job = futures[future]
                 error = future.exception()
                 if isinstance(error, KilledWorker):
                     yield worker_died(job)
                 elif error is not None:
-                    yield Outcome(job.name, "failed", f"{type(error).__name__}: {error}")
+                    yield _raised(job, error)
                 else:
                     yield future.result()

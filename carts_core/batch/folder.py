@@ -308,8 +308,9 @@ def _known(jobs: int, job: Job, before: KnownJob | None, joints: JointErrors | N
         return KnownJob(job, "waiting", JobState())
     try:
         state = _state(lambda: typed_json(read_bytes(JOB_FILE, VALUES, folder), JobState)) if written[0] else JobState()
-        lost = state.status == "running" and _is_free(folder)
         results, damage = _results(folder, joints) if written[1] else (None, "")
+        # Checked last, since the check holds the lock until the folder is closed.
+        lost = state.status == "running" and not _beats(state) and _is_free(folder)
     finally:
         os.close(folder)
     return KnownJob(job, "lost" if lost else state.status, state, results, damage, written[0] + written[1])
@@ -336,6 +337,12 @@ def _written(folder: int, name: str) -> tuple[int, ...]:
     except OSError:
         return ()
     return (found.st_ino, found.st_mtime_ns, found.st_size) if stat.S_ISREG(found.st_mode) else ()
+
+
+def _beats(state: JobState) -> bool:
+    """Whether a job of another computer had a recent heartbeat; locks of network file systems may be local."""
+    host = state.worker.rpartition(":")[0]
+    return host != socket.gethostname() and abs(time.time() - state.heartbeat) < 3 * HEARTBEAT_SECONDS
 
 
 def _is_free(folder: int) -> bool:

@@ -108,7 +108,7 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
     """Files and folders matched by patterns, sorted by name for each pattern."""
     folder, found = manifest.absolute().parent, []
     for pattern in patterns:
-        matched = sorted(glob.glob(str(folder / pattern), recursive=True))
+        matched = sorted(glob.glob(os.path.join(glob.escape(str(folder)), pattern), recursive=True))
         if output is not None and glob.has_magic(pattern):
             made = f"{output.resolve()}{os.sep}"
             real = resolved_paths(matched)

@@ -88,8 +88,10 @@ class Live(RangedOptions):
             held.callback(tracker.close)
             if stream.server is not None:
                 console.print(f"listening on 127.0.0.1:{stream.server.port}")
-            lines = self._lines()
-            recorder = None
+            lines, sinks, recorder = self._lines(), [], None
+            if self.overlay:
+                sinks.append(overlay := KeyedOverlay(sequence, dict(zip(cameras, self.overlay, strict=True))))
+                held.callback(overlay.close)
             if self.record is not None:
                 made_by = Provenance.made_by_optimizer({"live": True}, extractor.sha256)
                 recorder = Recorder(sequence, cameras, self.record, made_by)
@@ -99,10 +101,7 @@ class Live(RangedOptions):
                 for send in (*lines, *stream.clients):
                     send(message)
 
-            sinks = [show, *([recorder] if recorder is not None else [])]
-            if self.overlay:
-                sinks.append(overlay := KeyedOverlay(sequence, dict(zip(cameras, self.overlay, strict=True))))
-                held.callback(overlay.close)
+            sinks = [show, *sinks, *([recorder] if recorder is not None else [])]
             statistics = LiveStatistics()
             try:
                 # Ctrl-C is the normal way to stop; a closed output pipe also stops tracking.
@@ -116,6 +115,8 @@ class Live(RangedOptions):
                     )
                 if recorder is not None and (path := recorder.close()) is not None:
                     console.print(f"wrote {path}. To inspect it: carts view {path}")
+                    if recorder.shortfall:
+                        console.print(recorder.shortfall)
 
     def _lines(self) -> "list[Callable]":
         """Functions that write results as lines of JSON."""

@@ -581,8 +581,8 @@ class OptimizeOptions:
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
-    """Output folder; by default `runs/NAME`. Results are written to its subfolder `DOMAIN/CAMERA`, where CAMERA combines
-    the names of all cameras with --together."""
+    """Output folder; by default `runs/NAME`. Results are written to its subfolder `DOMAIN/CAMERA`, where CAMERA
+    combines the names of all cameras with --together."""
     overwrite: bool = False
     """Discard earlier results in the folder and start over."""
     mode: Mode = "frame"

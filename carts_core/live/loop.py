@@ -78,7 +78,7 @@ class LiveStatistics:
         )
         if not self.ages:
             return text + verdicts
-        middle, late = (1000.0 * float(np.percentile(self.ages, share)) for share in (50, 95))
+        middle, late = 1000.0 * np.percentile(self.ages, (50, 95))
         return f"{text}{verdicts}. Latency: median {middle:.0f} ms, 95th percentile {late:.0f} ms"
 
 

@@ -208,9 +208,13 @@ class Assembler:
         self._count = 0
         self._changing = threading.Lock()
 
-    def moment(self, message: FrameMessage) -> StreamFrame | None:
+    def moment(self, message: FrameMessage, arrived: float | None = None) -> StreamFrame | None:
         """Frame completed by a message; None for a message without images, or until joints of every arm have
         arrived.
+
+        Args:
+            message: the message.
+            arrived: its time of arrival on the monotonic clock [s]; now by default.
 
         Raises:
             StreamError: the message has an unknown arm, joint or camera, lacks an image, or has an invalid image,
@@ -234,7 +238,7 @@ class Assembler:
                 masks=None,
                 timestamp=message.time,
             )
-            return StreamFrame(frame, dict(self._poses))
+            return StreamFrame(frame, dict(self._poses), time.monotonic() if arrived is None else arrived)
 
     def _take_joints(self, message: FrameMessage) -> None:
         for name, joints in message.joints.items():

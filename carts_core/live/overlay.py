@@ -94,15 +94,16 @@ class KeyedOverlay:
         self._thread.join(_PATIENCE)
 
     def _run(self) -> None:
-        with self._held:
-            try:
+        try:
+            # After the exit of one reader all pipes are closed, so that no other reader shows an old outline.
+            with self._held:
                 while (tracked := self._waiting.get()) is not None:
                     state, verdict = tracked.estimate.state.to("cpu"), tracked.estimate.verdict
                     if verdict is LiveVerdict.GOOD and not tracked.current:
                         verdict = LiveVerdict.DOUBTFUL
                     for pipe in self._pipes:
                         pipe.draw(state, verdict)
-            except BrokenPipeError:
-                _log.warning("The reader of the overlay has exited; tracking continues without an overlay.")
-                while self._waiting.get() is not None:
-                    pass
+        except BrokenPipeError:
+            _log.warning("A reader of the overlay has exited; tracking continues without an overlay.")
+            while self._waiting.get() is not None:
+                pass

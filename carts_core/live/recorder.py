@@ -1,5 +1,6 @@
 """Recording of a stream as a sequence, with the corrections as its project."""
 
+import logging
 import queue
 import threading
 from collections.abc import Collection
@@ -22,9 +23,12 @@ from ..project import Edits, FitVerdict, JointCorrection, Key, Project, Provenan
 from ..recording import Sequence
 from ..recording.matching import ORIENTATION, POSITION
 from ..recording.sequence_file import FORMAT
+from ..wording import counted
 from .loop import Tracked
 from .messages import mounts_of
 from .tracker import LiveVerdict
+
+_log = logging.getLogger(__name__)
 
 _WAITING = 32
 """Maximum number of frames waiting for the disk; further frames are not recorded."""
@@ -60,6 +64,7 @@ class Recorder:
 
     Attributes:
         missed: number of frames that were not recorded because the disk was too slow.
+        shortfall: sentence on these frames; empty if there are none.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -87,35 +92,47 @@ class Recorder:
         except queue.Full:
             self.missed += 1
 
+    @property
+    def shortfall(self) -> str:
+        """See the class."""
+        return f"{counted(self.missed, 'frame')} not recorded, since the disk was too slow." if self.missed else ""
+
     def close(self) -> Path | None:
         """Finish writing; returns the sequence file, or None without frames.
 
         Raises:
-            CartsError: a file could not be written.
+            CartsError: a file could not be written. The frames before are in the recording.
         """
         self._waiting.put(None)
         self._thread.join()
-        if self._error is not None:
-            raise self._error
+        path = (self._output / "sequence.toml").path
         if not self._edits:
             # Without frames the folder remains empty, so that the same command can be repeated.
             remove_file(self._output / "sequence.toml")
+            if self._error is not None:
+                raise self._error
             return None
-        path = (self._output / "sequence.toml").path
+        self._write_project(path)
+        if self._error is not None:
+            text = f"{self._error} The {counted(len(self._edits), 'frame')} before this error are in {path}."
+            raise OutputError(text) from self._error
+        return path
+
+    def _write_project(self, path: Path) -> None:
         project = Project.open(Sequence.open(path), path.with_suffix(".carts"))
         try:
             merged: Edits = {key: value for edits in self._edits for key, value in edits.items()}
             project.apply("Live", merged)
         finally:
             project.close()
-        return path
 
     def _write(self) -> None:
         while (tracked := self._waiting.get()) is not None:
             if self._error is None:
                 try:
                     self._write_one(tracked)
-                except Exception as error:  # The error is reported at the end, and the stream continues.
+                except Exception as error:  # The stream continues.
+                    _log.warning("Recording has stopped: %s", error)
                     self._error = error
 
     def _describe(self) -> None:

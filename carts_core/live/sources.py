@@ -102,6 +102,16 @@ class StreamServer:
             for client in self._clients.values():
                 _put_newest(client.waiting, None)
         _put_newest(self._moments, None)
+        # Clients that do not read their results would stay connected.
+        timer = threading.Timer(_LINGER, self._disconnect)
+        timer.daemon = True
+        timer.start()
+
+    def _disconnect(self) -> None:
+        with self._changing:
+            for connection in self._clients:
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def _accept(self) -> None:
         while not self._closed.is_set():
@@ -140,7 +150,7 @@ class StreamServer:
         try:
             while (message := receive(connection)) is not None and not self._closed.is_set():
                 client.heard, client.sends = time.monotonic(), True
-                moment = self._assembler.moment(message)
+                moment = self._assembler.moment(message, client.heard)
                 if moment is not None:
                     _put_newest(self._moments, moment)
             if client.sends:
@@ -269,10 +279,10 @@ class Camera(_Closable):
                 fine, image = self._capture.read()
                 if not fine:
                     return
-                due += self._gap
+                due, arrived = due + self._gap, time.monotonic()
                 data = np.ascontiguousarray(image[..., ::-1])
                 picture = ImageMessage(data.tobytes(), "rgb8", data.shape[1], data.shape[0])
-                moment = self._assembler.moment(FrameMessage(time.monotonic() - began, images={self._camera: picture}))
+                moment = self._assembler.moment(FrameMessage(arrived - began, images={self._camera: picture}), arrived)
                 if moment is not None:
                     yield moment
         finally:
@@ -308,9 +318,9 @@ class Folder(_Closable):
             newest = max((path.stem for path in self._folder.glob("*.json")), default="")
             if newest <= seen:
                 continue
-            seen = newest
+            seen, arrived = newest, time.monotonic()
             try:
-                moment = self._assembler.moment(self._message(newest))
+                moment = self._assembler.moment(self._message(newest), arrived)
             except StreamError as error:
                 self._leave_out(error)
                 continue

@@ -91,6 +91,8 @@ def change(before: Picture, now: Picture) -> float:
     return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())
 
 
+_STARTED_AGAIN = 1.0
+"""Decrease of timestamps above which tracking starts over [s]."""
 _REMEMBERED = 60
 """Number of recent good fits whose median loss is the reference."""
 _LOOK_AGE = 1.0
@@ -200,7 +202,7 @@ class LiveTracker:
         cameras: Sequence[str] | None = None,
         concurrent: bool = False,
     ) -> None:
-        self.settings, self.live, self.verdict = settings or SurfaceSolver(), live or LiveSettings(), LiveVerdict.LOST
+        self.settings, self.live = settings or SurfaceSolver(), live or LiveSettings()
         self._scene, self._predictor = scene.with_cameras(cameras), predictor_of(networks)
         self._model, self._free = model or SequenceSettings(look_every=_LOOK_EVERY), free or FreeParameters()
         stages: dict[str, tuple[Stage, ...]] = {
@@ -218,6 +220,14 @@ class LiveTracker:
         self._colours = ColourTracker(self._model)
         self._moving = False
         self._errors: ErrorModel | None = None
+        self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
+        self._start_over()
+
+    def _start_over(self) -> None:
+        """Forget all frames."""
+        self.verdict = LiveVerdict.LOST
+        self._time = -math.inf
+        """Timestamp of the last frame [s]."""
         self._filtered: Gaussian | None = None
         """State of the error model after the last good frame."""
         self._seen = -math.inf
@@ -233,7 +243,6 @@ class LiveTracker:
         self._elsewhere = False
         """Whether the last check found an arm out of view and a prediction elsewhere."""
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
-        self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
         self._recovery: _Recovery | None = None
         self._look: _Look | None = None
         self._gave_up = False
@@ -247,6 +256,8 @@ class LiveTracker:
     def track(self, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> LiveEstimate:
         """Estimate the next frame.
 
+        If timestamps decrease by more than a second, as with a sender that is started again, tracking starts over.
+
         Args:
             frame: images, measured joint positions and timestamp.
             camera_poses: camera name -> T_camera_world [m], for cameras whose pose differs from that in the scene.
@@ -259,6 +270,11 @@ class LiveTracker:
         variables = self._variables(frame, camera_poses or {})
         self._moving = bool(camera_poses or frame.mounts)
         errors, now = self._error_model(variables), frame.timestamp or 0.0
+        if now < self._time - _STARTED_AGAIN:
+            if self._recovery is not None:
+                self._recovery.dropped.set()
+            self._start_over()
+        self._time = now
         recovered = self._take_recovered(errors)
         self._take_look(errors)
         attempt, measurement = self._measured(frame, variables, errors, now, found_again=recovered is not None)

@@ -227,7 +227,8 @@ class Backgrounds:
         or has the wrong size.
         """
         key = tuple(camera.name for camera in scene.cameras), size, dehaze, predictor
-        if key not in self._found:
+        found = self._found.pop(key, None)
+        if found is None:
             stacked = stacked_images(scene, self.images, size, "background").to(predictor.device)
             nothing = stacked.new_zeros(len(stacked), SURFACE_CHANNELS, *stacked.shape[-2:])
             clear = dehazed(stacked, transmission(stacked, dehaze))
@@ -235,13 +236,12 @@ class Backgrounds:
             seen = predicted[:, COVERAGE].sum(1, keepdim=True).clamp(0.0, 1.0)
             unknown = {name: ~mask for name, mask in self._known.items()}
             known = pixel_weights(scene, unknown, size).to(seen)
-            self._found[key] = Background(stacked, known, seen * known)
-            while len(self._found) > _KEPT:
-                del self._found[next(iter(self._found))]
-        else:
-            # The first entry is the least recently used one.
-            self._found[key] = self._found.pop(key)
-        return self._found[key]
+            found = Background(stacked, known, seen * known)
+        # The first entry is the least recently used one. Several threads of a tracker may change the entries.
+        self._found[key] = found
+        while len(self._found) > _KEPT:
+            self._found.pop(next(iter(self._found)), None)
+        return found
 
 
 _MADE: WeakKeyDictionary[Recording, dict[tuple[tuple[str, ...], str, bool], Backgrounds]] = WeakKeyDictionary()

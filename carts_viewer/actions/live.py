@@ -69,6 +69,10 @@ class LiveHandler(Handler):
         return self._live is not None
 
     def _on_StopLive(self, intent: intents.StopLive) -> None:
+        self.end_soon()
+
+    def end_soon(self) -> None:
+        """End the stream, if any, at the next step."""
         shown = self._context.state.live
         if self.active and shown is not None:
             # The solver may take a while to answer.

@@ -1,6 +1,7 @@
 """A tracked live stream of the solver, whose newest results are sent to the page."""
 
 import threading
+import time
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _WAIT = 0.1
 """Maximum waiting time for a result, so that other requests are answered in the meantime [s]."""
+_STATISTICS_INTERVAL = 0.5
+"""Interval of the statistics [s]; they take milliseconds after an hour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +109,22 @@ def tracked_stream(
         raise
     port = None if stream.server is None else stream.server.port
     try:
-        stop = yield LiveStep("", port)
+        stop, text, due = (yield LiveStep("", port)), "", 0.0
         while not stop and not run.over:
             taken = run.take()
-            stop = yield LiveStep(str(run.statistics), port, taken and _result(sequence.scene, taken))
+            if time.monotonic() >= due:
+                text, due = str(run.statistics), time.monotonic() + _STATISTICS_INTERVAL
+            stop = yield LiveStep(text, port, taken and _result(sequence.scene, taken))
     finally:
         stream.close()
         run.join(10.0)
         tracker.close()
-    recorded = None if recorder is None else recorder.close()
+    recorded, text = None if recorder is None else recorder.close(), str(run.statistics)
+    if recorder is not None and recorder.shortfall:
+        text += f". {recorder.shortfall.removesuffix('.')}"
     if run.error is not None and not isinstance(run.error, CartsError):
         raise run.error
-    yield LiveEnded(str(run.statistics), recorded, None if run.error is None else str(run.error))
+    yield LiveEnded(text, recorded, None if run.error is None else str(run.error))
 
 
 class _Follower(threading.Thread):

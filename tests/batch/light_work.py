@@ -11,11 +11,13 @@ from carts_core.batch.manifest import Job
 
 @dataclass(frozen=True)
 class LightWork:
-    """Appends a line to a file of the job; jobs named in `dies` kill their worker that many times."""
+    """Appends a line to a file of the job; jobs named in `dies` kill their worker that many times, and those in
+    `raises` raise an error."""
 
     folder: Path
     dies: tuple[tuple[str, int], ...] = ()
     fails: tuple[str, ...] = ()
+    raises: tuple[str, ...] = ()
 
     def begun(self, job: str) -> int:
         """Number of times that a job was begun."""
@@ -28,6 +30,8 @@ class LightWork:
             file.write("begun\n")
         if self.begun(job.name) <= dict(self.dies).get(job.name, 0):
             os.kill(os.getpid(), signal.SIGKILL)
+        if job.name in self.raises:
+            raise OSError("No space left on device")
         if job.name in self.fails:
             return Outcome(job.name, "failed", "as asked for")
         return Outcome(job.name, "done")

@@ -5,6 +5,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import distributed
 import pytest
 from light_work import LightWork, process_and_threads
 
@@ -39,6 +40,36 @@ def test_jobs_of_a_killed_worker_are_done_by_another_one_until_they_are_given_up
     # Dask repeats a job whose result was lost with its worker.
     assert begun == expected if given_up else begun >= expected and begun[1] >= expected[1]
     assert (f"died {ATTEMPTS} times" in found["job02"].error) is given_up
+
+
+@pytest.mark.parametrize(
+    "engine",
+    [
+        pytest.param(lambda work: Pool(work, 2, 1), id="pool"),
+        pytest.param(lambda work: Cluster(work, "local", 2, 1), id="dask", marks=pytest.mark.slow),
+    ],
+)
+def test_an_unexpected_error_of_a_job_is_reported_and_the_job_is_not_repeated(
+    tmp_path: Path, engine: Callable[[Work], Pool | Cluster]
+) -> None:
+    work = LightWork(tmp_path, raises=("job01",))
+    found = {outcome.job: outcome for outcome in engine(work).run(jobs(3))}
+    assert [found[job.name].status for job in jobs(3)] == ["done", "failed", "done"]
+    assert found["job01"].error == "OSError: No space left on device" and work.begun("job01") == 1
+
+
+@pytest.mark.slow
+def test_batches_with_jobs_of_the_same_names_share_a_scheduler(tmp_path: Path) -> None:
+    works = [LightWork(tmp_path / name) for name in "ab"]
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        for work in works:
+            work.folder.mkdir()
+        address: str = cluster.scheduler_address  # pyright: ignore[reportAttributeAccessIssue]
+        first = Cluster(works[0], address, 1, 1).run(jobs(2))
+        begun = next(first)
+        second = list(Cluster(works[1], address, 1, 1).run(jobs(2)))
+        assert {outcome.status for outcome in (begun, *second, *first)} == {"done"}
+    assert [work.begun(job.name) for work in works for job in jobs(2)] == [1, 1, 1, 1]
 
 
 def test_a_job_whose_process_was_killed_is_lost(tmp_path: Path) -> None:

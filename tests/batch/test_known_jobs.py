@@ -2,8 +2,10 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -122,6 +124,15 @@ def test_damaged_results_are_reported_and_the_other_jobs_are_read(tmp_path: Path
     assert damaged.results is None and "Run the batch again to recreate it" in damaged.error
     assert failed.status == "failed" and "job.json cannot be read" in failed.error
     assert whole.results is not None and whole.results.frames == 2
+
+
+def test_jobs_of_another_computer_are_lost_without_a_recent_heartbeat(tmp_path: Path) -> None:
+    silent, beating, here = (
+        JobState("running", worker=f"{host}:1", heartbeat=beat)
+        for host, beat in (("other", 1.0), ("other", time.time()), (socket.gethostname(), time.time()))
+    )
+    batch, jobs, _ = archive(tmp_path, [], silent=silent, beating=beating, here=here)
+    assert [entry.status for entry in known_jobs(batch, jobs)] == ["lost", "running", "lost"]
 
 
 def test_links_in_the_folder_of_jobs_are_not_followed(tmp_path: Path) -> None:

@@ -34,6 +34,13 @@ def test_every_recording_camera_and_domain_is_a_job(archive: Path) -> None:
     assert {job.recording for job in jobs} == {archive / name / "sequence.toml" for name in "abc"}
 
 
+def test_the_folder_of_a_manifest_may_have_any_name(tmp_path: Path) -> None:
+    folder = tmp_path / "[2024] *"
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / "sequence.toml").write_text("")
+    assert [job.recording for job in read_manifest(manifest(folder, JOBS))] == [folder / "a" / "sequence.toml"]
+
+
 def test_what_a_batch_has_made_is_no_new_recording(archive: Path) -> None:
     made = archive / "runs" / "calibration"
     made.mkdir(parents=True)

@@ -79,15 +79,21 @@ def test_another_program_reads_outlines_on_green(
 def test_tracking_continues_if_the_reader_ends(
     sequence: Sequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    os.mkfifo(tmp_path / "left")
-    reader = os.open(tmp_path / "left", os.O_RDONLY | os.O_NONBLOCK)
-    overlay = KeyedOverlay(sequence, {"left": tmp_path / "left"})
-    os.close(reader)
+    pipes = {name: tmp_path / name for name in ("left", "right")}
+    for pipe in pipes.values():
+        os.mkfifo(pipe)
+    left, right = (os.open(pipe, os.O_RDONLY | os.O_NONBLOCK) for pipe in pipes.values())
+    overlay = KeyedOverlay(sequence, pipes)
+    os.close(left)
     for index in (0, 1, 0):
         overlay(tracked(sequence, index, LiveVerdict.GOOD))
+    # The other pipe ends, so that its reader does not show an old outline.
+    os.set_blocking(right, True)
+    with os.fdopen(right, "rb") as other:
+        other.read()
     overlay.close()
     assert [record.message for record in caplog.records] == [
-        "The reader of the overlay has exited; tracking continues without an overlay."
+        "A reader of the overlay has exited; tracking continues without an overlay."
     ]
 
 

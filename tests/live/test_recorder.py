@@ -5,9 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from moving import swing
 
+from carts_core.errors import OutputError
 from carts_core.export.kinematics import read_kinematics_csv
+from carts_core.files import OutputPath, write_bytes
 from carts_core.live.loop import Tracked
 from carts_core.live.messages import StreamFrame
 from carts_core.live.recorder import Recorder
@@ -62,6 +65,24 @@ def test_where_no_frame_came_nothing_is_left(tiny_sequence: Callable[..., Path],
     for _ in range(2):
         assert Recorder(sequence, ("left",), tmp_path / "recorded", Provenance(Source.HAND)).close() is None
         assert not any((tmp_path / "recorded").iterdir())
+
+
+def test_frames_before_a_write_error_are_recorded_with_their_corrections(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, folder = Sequence.open(tiny_sequence(frames=3)), tmp_path / "recorded"
+
+    def full(path: OutputPath, content: bytes) -> None:
+        if path.path.name == "000002.png":
+            raise OutputError("No space left on device.")
+        write_bytes(path, content)
+
+    monkeypatch.setattr("carts_core.live.recorder.write_bytes", full)
+    with pytest.raises(OutputError, match=r"No space left.* The 2 frames before this error are in .*recorded"):
+        record(sequence, folder, [{}, {}, {}])
+    project = Project.open(Sequence.open(folder / "sequence.toml"), folder / "sequence.carts", read_only=True)
+    assert [len(project.state.joints(index)) for index in range(2)] == [1, 1]
+    project.close()
 
 
 def test_a_camera_that_stays_is_recorded_without_a_motion(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:

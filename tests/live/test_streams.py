@@ -273,6 +273,22 @@ def test_a_client_that_never_reads_holds_nobody_up(assembler: Assembler) -> None
         server.close()
 
 
+def test_a_client_that_never_reads_is_disconnected_at_the_end(
+    assembler: Assembler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carts_core.live.sources._LINGER", 0.1)
+    server = StreamServer(assembler, 0)
+    with connected(server) as client:
+        eventually(lambda: len(server._clients) == 1)
+        for _ in range(8):
+            server.send(msgspec.structs.replace(RESULT, masks={"left": bytes(10**7)}))
+        server.close()
+        eventually(lambda: not server._clients)
+        with suppress(ConnectionError):
+            while client.recv(1 << 20):
+                pass
+
+
 def _accepted(server: StreamServer) -> bool:
     """Whether one more client gets a result."""
     with connected(server) as client:

@@ -119,6 +119,18 @@ def test_the_first_frame_is_searched_and_later_ones_take_little(stream: Stream) 
     assert np.isfinite(std).all() and (std[:2] < np.deg2rad(2.0)).all(), "less than before any image"
 
 
+def test_tracking_starts_over_if_the_clock_of_a_sender_does(stream: Stream) -> None:
+    stream.time = 1000.0
+    for _ in range(2):
+        assert stream.next()[0] is LiveVerdict.GOOD
+    stream.time, stream.slip = 0.0, 0.05
+    stream.come_round(SECONDS)
+    verdict, effort, error = stream.next()
+    assert (verdict, effort) == (LiveVerdict.GOOD, Effort.SEARCH) and error < 0.4 * np.rad2deg(stream.slip)
+    stream.time -= 2.5 * SECONDS  # Frames that are slightly out of order are frames of the same stream.
+    assert stream.next()[:2] == (LiveVerdict.GOOD, Effort.SMALL)
+
+
 def test_a_hidden_arm_is_lost_and_found_again_where_it_was(stream: Stream) -> None:
     for _ in range(3):
         stream.next()

@@ -9,15 +9,17 @@ import numpy as np
 import psutil
 import pytest
 from playwright.sync_api import expect
-from viewer_tab import OpenTab
+from viewer_tab import OpenTab, place_of
 from waiting import eventually
 
 from carts_core.live import FrameMessage, ImageMessage, packed
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
+from carts_viewer import tabs
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.panels.fit import live_text
+from tools.raw_tab import RawTab
 
 SECONDS = 120.0
 """For the networks to be there, on a busy machine."""
@@ -110,6 +112,15 @@ def test_the_recording_is_shown_again_if_the_solver_process_ends(app: ViewerApp)
     eventually(lambda: app.state.live, lambda live: live is not None and live.on and not live.busy, SECONDS)
     app.queue.put(intents.StopLive())
     eventually(lambda: app.state.streaming, lambda on: not on)
+
+
+def test_the_stream_of_a_closed_tab_ends(app: ViewerApp, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tabs, "RECONNECT_TIME", 0.0)
+    with RawTab(app.url, key="live") as raw:
+        place = place_of(app, raw)
+        place.put(intents.StartLive("replay", rate=10.0, repeat=True))
+        eventually(lambda: place.controller.state.live, lambda live: live and live.on and not live.busy, SECONDS)
+    eventually(lambda: place.controller.state.streaming, lambda on: not on, SECONDS)
 
 
 def test_a_port_in_use_and_a_source_that_the_page_does_not_open_are_refused(app: ViewerApp) -> None:
