@@ -40,7 +40,7 @@ class ImportOptions:
     source: str | None = None
     """Source format (listed by `carts import` without arguments); detected by default."""
     images: Mapping[str, str] = field(default_factory=dict)
-    """Camera -> images: a folder, file pattern, video, or topic of the bag."""
+    """Camera -> images: a folder, a video, or a topic of the bag."""
     calibration: Mapping[str, Path] = field(default_factory=dict)
     """Camera -> calibration file (ROS, OpenCV or Kalibr YAML, JSON, MATLAB .mat)."""
     calibration_size: Mapping[str, str] = field(default_factory=dict)

@@ -174,6 +174,11 @@ _CHOICES = {
     "length_unit": get_args(LengthUnit),
     "clock": ("s", "ms", "us", "ns"),
 }
+_OF_TABLES = (
+    *("columns", "flip", "units", "angle_unit", "length_unit", "clock"),
+    *("time_offset", "arm_time_offset", "row_rate", "frame_rate"),
+)
+"""Options that only a table of kinematics has."""
 _NUMBERS = ("time_offset", "frame_rate", "row_rate", "tool_point")
 _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
@@ -205,14 +210,16 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
     elif kind == "unit" and which in (*JOINT_NAMES, "jaw"):
         options["units"] = _with(draft.options.units, which, value)
     elif name == "no-table":
-        options |= {"kinematics": NO_TABLE, "columns": {}, "flip": (), "units": {}}
+        defaults = ImportOptions()
+        options |= {name: getattr(defaults, name) for name in _OF_TABLES} | {"kinematics": NO_TABLE}
     elif kind == "column" and which in _MEANINGS:
         options["columns"] = _columns(draft, which, value, guessed)
     elif kind == "meaning" and (not value or value in _MEANINGS):
         chosen = {role: column for role, column in draft.options.columns.items() if column != which}
         options["columns"] = _columns(draft.with_options(columns=chosen), value, which, guessed) if value else chosen
     elif name == "remove-camera":
-        options["images"] = _with(draft.options.images, value, "")
+        for known in ("images", "calibration", "calibration_size"):
+            options[known] = _with(getattr(draft.options, known), value, "")
     return draft.with_options(**options) if options else None
 
 

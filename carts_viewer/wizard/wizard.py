@@ -19,7 +19,7 @@ from carts_viewer.wizard.points import ClickPrompt
 
 _SOURCES = (*VIDEO_SUFFIXES, ".bag", ".mcap", ".parquet")
 _TABLES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
-_CALIBRATIONS = (".yaml", ".yml", ".mat", ".json", ".ini", ".txt")
+_CALIBRATIONS = (".yaml", ".yml", ".mat", ".json", ".ini", ".xml", ".txt")
 _PURPOSES = {
     "source": ("Choose the folder of the recording: images or videos, and a table of joints.", _SOURCES, True),
     "images": ("Choose a folder of images, or a video.", VIDEO_SUFFIXES, True),

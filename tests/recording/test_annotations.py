@@ -143,6 +143,20 @@ def test_polygons_masks_and_points_of_cvat_are_read_in_their_order(sequence: Seq
     assert (found.labels == 2).sum() == 200 and (found.labels == 1).sum() == 10, "the shaft lies above the wrist"
 
 
+def test_shapes_of_cvat_that_are_not_read_are_remarked(sequence: Sequence, tmp_path: Path) -> None:
+    path = tmp_path / "annotations.xml"
+    path.write_text(CVAT.format(more='<box label="shaft" xtl="1" ytl="1" xbr="5" ybr="5"/>'))
+    found = read_annotations(path, sequence)
+    list(found.frames)
+    assert list(found.remarks) == ["a box (shaft) of right_003.png: only masks, polygons and points are read"]
+
+
+def test_names_of_roboflow_have_no_frame_number_in_their_end(sequence: Sequence, tmp_path: Path) -> None:
+    path = tmp_path / "annotations.xml"
+    path.write_text(CVAT.format(more="").replace("right_003.png", "right_003_png.rf.2c6f1e0a9b7.jpg"))
+    assert list(all_of(path, sequence)[0]) == [(2, "right")]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

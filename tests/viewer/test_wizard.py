@@ -97,6 +97,20 @@ def test_a_question_about_units_and_rates_is_answered_in_the_form(tmp_path: Path
     assert found.recording is not None and found.recording.frame_times == pytest.approx(np.arange(FRAMES) / 10)
 
 
+def test_what_belongs_to_a_table_or_a_camera_goes_with_it(tmp_path: Path) -> None:
+    draft = recording(tmp_path / "rec", ["q1", "q2", "q3", "q4", "q5", "q6"], JOINTS)
+    made, found = after(draft, ("angle_unit", "deg"), ("frame_rate", "30"), ("no-table", ""))
+    assert found.recording is not None and made.options == replace(draft.options, kinematics=Path("none"))
+    extra = draft.with_options(
+        images={"left": str(tmp_path / "rec/left"), "extra": str(tmp_path / "rec/left")},
+        calibration={"extra": tmp_path / "extra.yaml"},
+        calibration_size={"extra": "64x48"},
+    )
+    made = changed(extra, "remove-camera", "extra", {})
+    assert made is not None and [*made.options.images] == ["left"]
+    assert not made.options.calibration and not made.options.calibration_size
+
+
 def test_columns_that_were_chosen_or_named_are_not_called_guessed(tmp_path: Path) -> None:
     draft = recording(tmp_path / "named", list(JOINT_NAMES), JOINTS)
     form = check_form(draft, guess(draft), {})

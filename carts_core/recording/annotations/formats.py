@@ -145,6 +145,10 @@ def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignIma
     name = image.get("name", "")
     with well_formed(f"{path}: image {name!r} cannot be read", _EXPORT):
         size, points = _size(image.attrib), dict(_cvat_keypoints(image))
+        for shape in image:
+            if shape.tag not in ("mask", "polygon", "points", "tag"):
+                what = f"a {shape.tag} ({shape.get('label', 'no label')}) of {name}"
+                remarks[f"{what}: only masks, polygons and points are read"] += 1
         check_shapes(len(image))
         check_keypoints(points)
 

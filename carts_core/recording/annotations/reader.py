@@ -20,6 +20,8 @@ from .recognition import AnnotationFormat, recognized
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
 """Files to read in the folder of an export."""
 _OWN_EXPORT = "export.json"
+_ROBOFLOW = re.compile(r"_(?:jpe?g|png|bmp|tiff?)\.rf\.[0-9A-Za-z]+$", re.IGNORECASE)
+"""End that Roboflow adds to the name of an image, with digits that are not a frame number."""
 
 
 def read_annotations(
@@ -112,7 +114,7 @@ class _FrameReader:
         camera = self._camera_of(image)
         if camera is None:
             return None
-        stem = PurePosixPath(image.name.replace("\\", "/")).stem
+        stem = _ROBOFLOW.sub("", PurePosixPath(image.name.replace("\\", "/")).stem)
         for text in (image.frame, stem, stem.removeprefix(f"{camera}_"), stem.removesuffix(f"_{camera}")):
             if text in self._ids:
                 return self._ids[text], camera

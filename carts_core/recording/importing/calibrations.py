@@ -26,9 +26,20 @@ _KINDS = (
     "dVRK's stereo calibration"
 )
 _MATRICES = ("camera_matrix", "K", "M", "cameraMatrix", "CameraMatrix", "intrinsic_matrix", "intrinsics", "mtx", "KK")
-_DISTORTIONS = ("distortion_coefficients", "distortion_coeffs", "distortion", "D", "distCoeffs", "dist_coeffs", "dist")
+_DISTORTIONS = (
+    *("distortion_coefficients", "distortion_coeffs", "distortion", "D", "distCoeffs", "dist_coeffs", "dist"),
+    *("dist_coeff", "distCoeff", "distortion_parameters", "kc"),
+)
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Names of OpenCV's distortion coefficients, in their order."""
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("nx", "ny"), ("res_x", "res_y"))
 _PAIRS = ("imageSize", "image_size", "resolution", "img_size")
+_WORLD_UNITS = {
+    **dict.fromkeys(("mm", "millimeters", "millimetres"), 1e-3),
+    **dict.fromkeys(("cm", "centimeters", "centimetres"), 1e-2),
+    **dict.fromkeys(("m", "meters", "metres"), 1.0),
+    **dict.fromkeys(("in", "inches"), 0.0254),
+}
 _METRES_TO = 1.0
 """Baseline above which lengths are assumed to be in millimetres [m]."""
 
@@ -53,8 +64,8 @@ class Calibration:
     """Remarks on how the file was interpreted, as sentences."""
 
 
-def read_calibration(path: Path, side: str) -> Calibration:
-    """Read the calibration of the left or right camera (`side`) from a file."""
+def read_calibration(path: Path, side: str, camera: str = "") -> Calibration:
+    """Read the calibration of the left or right camera (`side`), or of the camera of this name, from a file."""
     if not is_regular(path):
         raise SequenceError(f"calibration {path} is missing. Correct the path.")
     try:
@@ -66,7 +77,7 @@ def read_calibration(path: Path, side: str) -> Calibration:
         content = _content(path)
         if not isinstance(content, dict):
             raise ValueError("it has no named values")
-        return _from_names(content, side)
+        return _from_names(content, side, camera)
     except MALFORMED as error:
         raise SequenceError(
             f"calibration {path} cannot be used: {cause(error)}. Supported formats: {_KINDS}."
@@ -124,11 +135,12 @@ def _opencv_xml(text: str) -> dict[str, Any]:
     return values
 
 
-def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
+def _from_names(content: Mapping[str, Any], side: str, camera: str = "") -> Calibration:
     """Calibration from named values: ROS, OpenCV, Kalibr, camodocal and JSON."""
-    if isinstance(kalibr := content.get("cam1" if side == "right" else "cam0"), dict):
-        return _from_kalibr(kalibr)
-    if isinstance(own := content.get(side), dict):
+    own, kalibr = content.get(camera, content.get(side)), content.get("cam1" if side == "right" else "cam0")
+    if isinstance(kalibr, dict):
+        return _from_kalibr(own if isinstance(own, dict) else kalibr)
+    if isinstance(own, dict):
         content = {**content, **own}
     if content.get("fisheye_model") or content.get("fisheye"):
         check_model("fisheye")
@@ -139,22 +151,28 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
     K, D = _first(content, _MATRICES, suffixes), _first(content, _DISTORTIONS, suffixes)
     if K is None and (fc := _first(content, ("fc",), suffixes)) is not None:
         # Bouguet's toolbox for MATLAB counts pixels from 0.
-        cc, D = _first(content, ("cc",), suffixes), _first(content, ("kc",), suffixes)
+        cc = _first(content, ("cc",), suffixes)
         K = np.array([*fc.reshape(-1)[:2], *np.asarray(cc).reshape(-1)[:2]])
     elif K is None and {"fx", "fy", "cx", "cy"} <= set(content):
         K = np.array([content[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
     if K is None:
         raise ValueError(f"it has none of camera_matrix, K, M1 and cam0, only {', '.join(map(str, content))}")
+    D = _coefficients(content) if D is None else D
     found = _calibration(K, D, _size(content))
+    if D is None:
+        found = replace(found, remarks=(*found.remarks, "it has no distortion coefficients; none are assumed."))
+    T = _first(content, ("T", "t", "T_stereo"))
     if side == "right":
-        R, T = _first(content, ("R", "R_stereo")), _first(content, ("T", "t", "T_stereo"))
+        R = _first(content, ("R", "R_stereo"))
         if R is None and (om := _first(content, ("om",))) is not None and om.size == 3:
             R = Rotation.from_rotvec(om.reshape(3)).as_matrix()
         if R is not None and T is not None and R.size == 9 and T.size == 3:
             in_mm = float(np.linalg.norm(T)) > _METRES_TO
             remark = f"its translation of {np.linalg.norm(T):.4g} is assumed to be in millimetres."
             found = _placed(found, R, T * 1e-3 if in_mm else T, *([remark] if in_mm else []))
-    R, P = (_first(content, (name,), suffixes) for name in ("rectification_matrix", "projection_matrix"))
+    P = _first(content, ("projection_matrix", "P"), suffixes)
+    # Beside a translation, R without a suffix is the rotation between the cameras.
+    R = _first(content, ("rectification_matrix", "R"), suffixes if T is None else suffixes[1:])
     return replace(found, R=_rotation(R), P=_projection(P))
 
 
@@ -230,10 +248,20 @@ def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[s
         for suffix in suffixes:
             value = content.get(name + suffix)
             if isinstance(value, dict):
-                value = value.get("data", [value[key] for key in ("fx", "fy", "cx", "cy") if key in value] or None)
+                numbers = [value[key] for key in ("fx", "fy", "cx", "cy") if key in value]
+                value = value.get("data", numbers or _coefficients(value))
             if value is not None and not isinstance(value, str):
                 return np.array(value, np.float64)
     return None
+
+
+def _coefficients(content: Mapping[str, Any]) -> np.ndarray | None:
+    """Distortion coefficients with names; missing ones are 0. None if there are none."""
+    known = [place for place, name in enumerate(_COEFFICIENTS) if name in content]
+    if not known:
+        return None
+    count = min(length for length in DISTORTION_LENGTHS if length > max(known))
+    return np.array([float(content.get(name, 0.0)) for name in _COEFFICIENTS[:count]])
 
 
 def _rotation(values: np.ndarray | None) -> np.ndarray | None:
@@ -280,11 +308,20 @@ def _from_matlab(content: Any, side: str) -> Calibration:
     D = np.array([radial[0], radial[1], tangential[0], tangential[1], radial[2]])
     found = _from_one(_calibration(K, D, size))
     if right and "RotationOfCamera2" in content:
-        T = np.asarray(content["TranslationOfCamera2"], np.float64) * 1e-3
+        T = np.asarray(content["TranslationOfCamera2"], np.float64) * _matlab_unit(own, content)
         return _placed(found, np.asarray(content["RotationOfCamera2"]).T, T)
     if right and isinstance(pose := content.get("PoseCamera2"), dict):
-        return _placed(found, np.asarray(pose["R"]), np.asarray(pose["Translation"], np.float64) * 1e-3)
+        T = np.asarray(pose["Translation"], np.float64) * _matlab_unit(own, content)
+        return _placed(found, np.asarray(pose["R"]), T)
     return found
+
+
+def _matlab_unit(own: Mapping[str, Any], content: Mapping[str, Any]) -> float:
+    """Size of the unit of translations [m]; `ValueError` for unknown units."""
+    unit = str(own.get("WorldUnits") or content.get("WorldUnits") or "mm").lower()
+    if unit not in _WORLD_UNITS:
+        raise ValueError(f"its WorldUnits are {unit!r}; allowed: {', '.join(_WORLD_UNITS)}")
+    return _WORLD_UNITS[unit]
 
 
 def _from_one(found: Calibration) -> Calibration:

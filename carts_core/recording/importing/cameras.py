@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from ..video import Video, index_video
 from .calibrations import Calibration, calibration_from_info, read_calibration
 from .found import FoundCamera, Import, PartError
 
+_BASELINES = 1e-3, 0.1
+"""Usual distances between the cameras of a stereo endoscope [m]."""
 _SAME_SHAPE = 0.01
 """Maximum difference of aspect ratios due to rounding of image sizes [1]."""
 
@@ -35,7 +37,7 @@ def side_of(name: str) -> str | None:
     return found[-1] if found else None
 
 
-def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: bool) -> FoundCamera:
+def camera_from_info(camera: FoundCamera, info: Any, job: Import) -> FoundCamera:
     """Copy of a camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if `info` is None or
     uncalibrated."""
     what = f"camera_info of {camera.name}"
@@ -44,36 +46,58 @@ def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: 
     except ValueError as error:
         remedy = f"Give another one: --calibration {camera.name} FILE."
         raise PartError("calibration", f"{what} cannot be used: {error}.", remedy, about=camera.name) from error
-    return camera if found is None else _calibrated(camera, found, what, job, rectified=rectified)
+    return camera if found is None else _calibrated(camera, found, what, job)
 
 
-def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
-    """Copy of a camera with the calibration given in the options; unchanged without one."""
+def is_rectified(camera: FoundCamera) -> bool:
+    """Whether the names of a camera's images or topic indicate rectified images."""
+    parts = [*camera.images.parts[-2:], *camera.topic.split("/")]
+    words = {word for part in parts for word in re.split(r"[^a-z]+", part.lower())}
+    return "rect" in words or any("rectified" in part.lower() for part in parts)
+
+
+def sides_of(names: Sequence[str]) -> dict[str, str]:
+    """Camera -> side. Of two cameras without a side in their names, the first is the left one; a single one is left."""
+    known = {name: side_of(name) for name in names}
+    paired = len(names) == 2 and not any(known.values())
+    return {name: side or ("right" if paired and name == names[1] else "left") for name, side in known.items()}
+
+
+def calibration_of(camera: FoundCamera, job: Import, side: str | None = None) -> FoundCamera:
+    """Copy of a camera with the calibration given in the options; unchanged without one.
+
+    Args:
+        side: side of the camera in a pair; by default that of its name, or left.
+    """
     path = job.options.calibration.get(camera.name)
     if path is None:
         if camera.intrinsics is not None:
             job.found("calibration from the recording.", camera.name)
         return camera
     job.found(f"calibration from {path}.", camera.name)
-    side = side_of(camera.name) or "left"
+    named = side_of(camera.name)
+    side = side or named or "left"
+    if named is None and side == "right":
+        job.guessed(f"it is taken for the right camera of {path.name}.", camera.name)
     if side_of(path.stem) not in (None, side):
         text, remedy = f"{path.name} has the name of the other camera.", f"Check --calibration {camera.name} FILE."
         job.warning(text, camera.name, remedy=remedy)
-    parts = [part.lower() for part in camera.images.parts[-2:]]
-    rectified = any("rect" in re.split(r"[^a-z]+", part) or "rectified" in part for part in parts)
     try:
-        found = read_calibration(path, side)
+        found = read_calibration(path, side, camera.name)
     except SequenceError as error:
         raise PartError("calibration", f"camera {camera.name}: {error}", about=camera.name) from error
-    return _calibrated(camera, found, str(path), job, rectified=rectified)
+    return _calibrated(camera, found, str(path), job)
 
 
-def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import, *, rectified: bool) -> FoundCamera:
+def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import) -> FoundCamera:
     """Copy of a camera with a calibration, scaled to the size of its images."""
     for text in found.remarks:
         job.guessed(f"{what}: {text}", camera.name)
     intrinsics, distortion, R = found.intrinsics, found.distortion, found.R
-    if rectified and found.P is not None:
+    if is_rectified(camera) and found.P is None:
+        text = f"the image names indicate rectified images, but {what} has no projection matrix P; K is used"
+        job.warning(f"{text}.", camera.name)
+    elif found.P is not None and is_rectified(camera):
         fx, _, cx, _, _, fy, cy, *_ = map(float, found.P.reshape(-1))
         intrinsics, distortion, R = (fx, fy, cx, cy), (), np.eye(3)
         job.guessed(f"the image names indicate rectified images; P of {what} is used.", camera.name)
@@ -149,6 +173,11 @@ def placed_cameras(cameras: tuple[FoundCamera, ...], job: Import) -> tuple[Found
 
 def _placed(camera: FoundCamera, first: FoundCamera, job: Import) -> FoundCamera:
     if camera.T_camera_world is not None:
+        baseline = float(np.linalg.norm(camera.T_camera_world[:3, 3]))
+        job.found(f"{1e3 * baseline:.2f} mm from {first.name}, given by its calibration.", camera.name)
+        if (first.name, camera.name) == ("left", "right") and not _BASELINES[0] <= baseline <= _BASELINES[1]:
+            text = f"a baseline of {1e3 * baseline:.4g} mm is unusual for a stereo endoscope. Check its unit."
+            job.warning(text, camera.name)
         return camera
     lacking = [each.name for each in (first, camera) if each.rectification is None or each.projection is None]
     if not lacking:
@@ -295,11 +324,11 @@ def cameras_of(
 ) -> tuple[FoundCamera, ...]:
     """Cameras with their images and their given or detected calibrations."""
     job = job.with_options(calibration={**(calibrations or {}), **job.options.calibration})
-    cameras = []
+    cameras, sides = [], sides_of(tuple(images))
     for name, each in images.items():
         job.found(f"{each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.", name)
         for text in each.remarks:
             job.guessed(text, name)
         camera = FoundCamera(name, each.size, each.path, each.pattern, bits=each.bits)
-        cameras.append(calibration_of(camera, job))
+        cameras.append(calibration_of(camera, job, sides[name]))
     return tuple(cameras)

@@ -16,7 +16,7 @@ from .found import Import, PartError, Track
 from .joint_units import in_si, length_unit, named_length_unit, psm_joints
 from .logs import ArmLog, track
 
-_ARM = re.compile(r"(?i)(?:^|[^a-z])(psm\d?)(?![a-z])")
+_ARM = re.compile(r"(?i)(?:^|[^a-z])(psm(?:\d|(?![a-z\d])))")
 _FILLER = set(
     "joint joints j q js jp measured state current position pos positions angle angles value values rad radians deg "
     "degrees degree mm m meter meters column header outer action observation".split()
@@ -101,8 +101,10 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
             arms.setdefault(arm, {}).setdefault(meaning, column)
     stated |= {column for found in arms.values() for meaning, column in found.items() if not meaning.startswith("#")}
     arms = {arm: _numbers_to_joints(found) for arm, found in arms.items()}
-    if chosen:
-        arms = {next(iter(options.arms), next(iter(arms), "")): chosen}
+    for meaning, column in chosen.items():
+        arm = arm_in(column)
+        arm = arm if arm in arms else next(iter(options.arms), next(iter(arms), ""))
+        arms[arm] = {**arms.get(arm, {}), meaning: column}
     usable = {arm: found for arm, found in arms.items() if found.keys() >= _PSM or set(_POSE_ORDER) <= set(found)}
     if not usable and not chosen:
         usable = _numbered_family(words, (time, frame))

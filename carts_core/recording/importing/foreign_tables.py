@@ -238,4 +238,8 @@ def _numpy(path: Path) -> dict[str, np.ndarray]:
             # Position, velocity and effort of a joint state are stacked along the second axis, positions first.
             flat = values[:, 0] if values.ndim == 3 else values
             columns.update({f"{name}_{index + 1}": flat[:, index] for index in range(flat.shape[1])})
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        known = ", ".join(f"{name} {count}" for name, count in list(lengths.items())[:8])
+        raise ValueError(f"its arrays have different numbers of rows ({known}); store them in separate files")
     return columns

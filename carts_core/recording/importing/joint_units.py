@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.instruments import robot_file
+from ...model.psm_kinematics import JOINT_NAMES
 from ..kinematics_table import ANGLE_UNITS, FAR, LENGTH_UNITS, PERCENT, Joint, joints_of
 from .found import FoundArm, Import, PartError
 
@@ -35,9 +36,10 @@ def in_si(
             range.
     """
     names, options = [joint.name for joint in joints], job.options
+    allowed = (*JOINT_NAMES, "jaw") if instrument else (*names, "jaw")
     for option, joint in [*(("flip", joint) for joint in options.flip), *(("units", joint) for joint in options.units)]:
-        if joint not in (*names, "jaw"):
-            problem = f"{joint} is not a joint. Joints are: {', '.join(names)}."
+        if joint not in allowed:
+            problem = f"{joint} is not a joint. Joints are: {', '.join(allowed)}."
             raise PartError("columns", problem, f"Correct --{option}.")
     angle, length = options.angle_unit or "rad", options.length_unit or "m"
     if columns:
@@ -59,8 +61,7 @@ def in_si(
         elif unit in factors:
             result[:, index] *= factors[unit]
         else:
-            allowed = f"{', '.join(factors)} and {PERCENT}"
-            problem = f"the unit of {joint.name} is {unit}; allowed: {allowed}."
+            problem = f"the unit of {joint.name} is {unit}; allowed: {', '.join(factors)} and {PERCENT}."
             raise PartError("columns", problem, f"Correct --units {joint.name}.")
         if joint.name in options.flip:
             result[:, index] *= -1.0

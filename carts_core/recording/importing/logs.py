@@ -1,5 +1,6 @@
 """Logs of arms and of the endoscope: joint positions with times, instruments and base frames."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -234,8 +235,15 @@ def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4
     return Ts
 
 
-def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
-    """Determine joint positions and base frame of an arm; notes name their sources."""
+def arm_from_log(log: ArmLog, job: Import, start: float | None = None, motion: Track | None = None) -> FoundArm:
+    """Determine joint positions and base frame of an arm; notes name their sources.
+
+    Args:
+        start: time of the first image, at which the pose of the set-up joints is taken [s].
+        motion: motion of the endoscope from `endoscope_motion`, by which poses in the camera frame are converted to the
+            world.
+    """
+    log = _in_world(log, start, motion)
     robot = job.options.robot.get(log.name, FoundArm.robot)
     if log.names:
         assert log.joints is not None
@@ -255,6 +263,24 @@ def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
     else:
         job.missing("no jaw angle was recorded; the jaw is rendered closed.", log.name)
     return FoundArm(log.name, columns, values, joints.times, robot, T_camera_base, base_from)
+
+
+def _in_world(log: ArmLog, start: float | None, motion: Track | None) -> ArmLog:
+    """Convert poses in the frame of a moving camera to the world, and keep the set-up joints near the first image."""
+    if motion is not None:
+        log = replace(log, poses=_moved(log.poses, motion, log.T_axes), setup=_moved(log.setup, motion, log.T_axes))
+    if log.setup is not None and start is not None:
+        row = slice(place := int(np.abs(log.setup.times - start).argmin()), place + 1)
+        log = replace(log, setup=Track(log.setup.times[row], log.setup.values[row]))
+    return log
+
+
+def _moved(poses: Track | None, motion: Track, T_axes: Float[np.ndarray, "4 4"]) -> Track | None:
+    """Poses in the world, from poses in the camera frame at the same times."""
+    if poses is None:
+        return None
+    moved = np.linalg.inv(T_axes) @ motion.values[nearest(poses.times, motion.times)] @ T_axes
+    return _track_of_transforms(poses.times, moved @ transforms(poses.values))
 
 
 def _in_si(log: ArmLog, job: Import) -> ArmLog:
@@ -326,8 +352,15 @@ def _inverse_of(poses: Track | None) -> Track | None:
         return None
     Ts = transforms(poses.values)
     known = np.isfinite(Ts).all((1, 2))
-    Ts = np.linalg.inv(Ts[known])
-    return Track(poses.times[known], np.column_stack([Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]))
+    Ts[known] = np.linalg.inv(Ts[known])
+    return _track_of_transforms(poses.times, Ts)
+
+
+def _track_of_transforms(times: Float[np.ndarray, " rows"], Ts: Float[np.ndarray, "rows 4 4"]) -> Track:
+    """Inverse of `transforms`, without rows that are not finite."""
+    known = np.isfinite(Ts).all((1, 2))
+    Ts = Ts[known]
+    return Track(times[known], np.column_stack([Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]))
 
 
 def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
@@ -369,8 +402,16 @@ def _base_frame(log: ArmLog, geometry: PsmGeometry, job: Import) -> tuple[np.nda
         if not chosen:
             known = ", ".join(frame.arm for frame in frames)
             raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Give another file.")
-        job.found(f"base frame from {path}.", log.name)
-        return chosen[0].T_camera_base, str(path)
+        (frame, *_), recorded = chosen, job.options.arms.get(log.name)
+        reference = f", relative to {frame.reference}" if frame.reference else ""
+        job.found(f"base frame from {path}{reference}.", log.name)
+        if frame.arm not in ("", log.name, recorded):
+            remedy = f"Check --base {log.name} FILE."
+            job.warning(f"{path.name} has the base frame of {frame.arm}.", log.name, remedy=remedy)
+        if re.search(r"(?i)cart|world", frame.reference):
+            text = f"the base frame of {path.name} is relative to {frame.reference}, not to the camera"
+            job.warning(f"{text}; it is used as if it were.", log.name)
+        return frame.T_camera_base, str(path)
     if log.poses is not None and (log.joints is not None or log.local_poses is not None):
         T, what = _own_base_frame(log, geometry)
         if T is not None and np.abs(T - np.eye(4)).max() > _SAME_BASE:

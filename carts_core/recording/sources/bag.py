@@ -13,9 +13,9 @@ from ...errors import SequenceError
 from ...model import ecm_kinematics
 from ...model.psm_kinematics import JOINT_NAMES
 from ..image_sources import BAG_SUFFIXES, Bag, decode_message
-from ..importing.cameras import calibration_of, camera_from_info, cameras_of, common_ids, find_images, side_of
+from ..importing.cameras import calibration_of, camera_from_info, cameras_of, common_ids, find_images, side_of, sides_of
 from ..importing.columns import has_unknown_names, order_of_names, track_of
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, Track, recording_name
+from ..importing.found import FoundCamera, FoundRecording, Import, PartError, Source, Track, recording_name
 from ..importing.logs import ArmLog, arm_from_log, endoscope_motion, nearest
 from ..importing.row_matching import frame_times
 
@@ -37,9 +37,10 @@ def read_endoscope(bag: Bag, start: float, job: Import) -> Track | None:
     return None
 
 
-def _guessed_offset(times: Float[np.ndarray, " frames"], arms: list[FoundArm], job: Import) -> float:
+def _guessed_offset(times: Float[np.ndarray, " frames"], arms: list[ArmLog], job: Import) -> float:
     """Kinematics time minus time of image files [s]: 0 for overlapping clocks, else from a common start."""
-    logs = [arm.times for arm in arms if arm.times is not None]
+    known = (log.joints or log.local_poses or log.poses for log in arms)
+    logs = [logged.times for logged in known if logged is not None]
     apart = bool(logs) and (times[0] > max(log[-1] for log in logs) or times[-1] < min(log[0] for log in logs))
     offset = float(max(log[0] for log in logs) - times[0]) if apart else 0.0
     text = "the clocks do not overlap; a common start of images and kinematics is assumed" if offset else "0 s"
@@ -177,17 +178,18 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
     frame_times = times[leader][1]
     order = np.argsort(frame_times, kind="stable")
     frame_times = frame_times[order]
-    cameras = []
+    cameras, sides = [], sides_of((leader, *others))
     for name in (leader, *others):
         record, stamps = times[name]
         chosen = order if name == leader else nearest(frame_times, stamps)
         if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
             job.warning(f"times of images differ by up to {late:.3f} s from those of {leader}.", name)
-        info = _camera_info(bag, topics[name])
         first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
         size = (first.shape[1], first.shape[0])
         camera = FoundCamera(name, size, path, topic=topics[name], numbers=record[chosen])
-        cameras.append(calibration_of(camera_from_info(camera, info, job, rectified="rect" in topics[name]), job))
+        if name not in job.options.calibration:
+            camera = camera_from_info(camera, _camera_info(bag, topics[name]), job)
+        cameras.append(calibration_of(camera, job, sides[name]))
         job.found(f"{topics[name]}, {len(record)} images, {size[0]} x {size[1]}.", name)
     return tuple(cameras), frame_times
 
@@ -222,11 +224,12 @@ def _read(path: Path, job: Import) -> FoundRecording:
                 f"bag {path} has no kinematics of an arm (looked for /PSM1/measured_js, /PSM1/measured_cp and the "
                 f"names of dVRK 1.x). Its topics are: {known}."
             )
-        arms = [arm_from_log(log, job) for log in logs]
         offset = job.options.time_offset
         if offset is None:
-            offset = 0.0 if beside is None else _guessed_offset(frame_times, arms, job)
-        motion = read_endoscope(bag, float(frame_times[0]) + offset, job) if len(frame_times) else None
+            offset = 0.0 if beside is None else _guessed_offset(frame_times, logs, job)
+        start = float(frame_times[0]) + offset if len(frame_times) else None
+        motion = None if start is None else read_endoscope(bag, start, job)
+        arms = [arm_from_log(log, job, start, motion) for log in logs]
     name, kind = recording_name(path), "a ROS bag"
     return job.recording(kind, name, cameras, arms, ids, frame_times, time_offset=offset, motion=motion)
 

@@ -25,9 +25,18 @@ from ...files.reading import TABLE, VALUES, parse_yaml, read_text
 from ...model.psm_kinematics import JOINT_NAMES
 from ...wording import counted, listed
 from ..images import mask_remarks, read_mask, spread_files
-from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, subfolders
+from ..importing.cameras import (
+    Images,
+    calibration_of,
+    cameras_of,
+    common_ids,
+    files_with,
+    find_images,
+    image_files,
+    subfolders,
+)
 from ..importing.columns import order_of_names
-from ..importing.foreign_tables import read_array, read_foreign_table
+from ..importing.foreign_tables import TABLE_SUFFIXES, read_array, read_foreign_table
 from ..importing.found import (
     FoundArm,
     FoundCamera,
@@ -97,15 +106,25 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     return job.recording("a trajectory of SurgPose", path.name, numbered, found, kept_ids, found[0].times)
 
 
+def _detect_endovis(path: Path) -> bool:
+    """Whether a folder is a sequence of EndoVis, which has no kinematics."""
+    calibrated = (path / "camera_calibration.txt").is_file()
+    return bool(image_files(path / "left_frames")) and (calibrated or not files_with(path, TABLE_SUFFIXES))
+
+
 def _read_endovis(path: Path, job: Import) -> FoundRecording:
     folders = {side: path / f"{side}_frames" for side in ("left", "right")}
     images = {side: find_images(folder) for side, folder in folders.items() if image_files(folder)}
     ids = common_ids(images, path)
     cameras = []
-    for camera in cameras_of(images, job):
-        framed = camera.size == (1920, 1080)
-        shown = replace(camera, crop=_ENDOVIS_PART, size=_ENDOVIS_PART[2:]) if framed else camera
-        cameras.append(_endovis_calibration(shown, path / "camera_calibration.txt", job))
+    for camera in cameras_of(images, job.with_options(calibration={})):
+        shown = camera
+        if camera.size == (1920, 1080):
+            shown = replace(camera, crop=_ENDOVIS_PART, size=_ENDOVIS_PART[2:])
+            left, top, width, height = _ENDOVIS_PART
+            job.guessed(f"the part of {width} x {height} px at {left}, {top} is used, without the frame.", camera.name)
+        calibrated = calibration_of(shown, job)
+        cameras.append(_endovis_calibration(calibrated, path / "camera_calibration.txt", job))
     job.missing("labels of EndoVis are class numbers, not 0 and 255, and are left out.")
     return job.recording("a sequence of EndoVis", path.name, cameras, (), ids, None)
 
@@ -204,7 +223,7 @@ ENDOVIS = Source(
     "endovis",
     "a sequence of EndoVis 2017 or 2018",
     "a folder with left_frames/",
-    lambda path: bool(image_files(path / "left_frames")),
+    _detect_endovis,
     (),
     _read_endovis,
 )

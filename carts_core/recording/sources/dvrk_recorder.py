@@ -48,7 +48,18 @@ def _detect(path: Path) -> bool:
         return False
     if (path / "index.json").is_file():
         return True
-    return any((video.with_suffix(".json")).is_file() for video in files_with(path, VIDEO_SUFFIXES))
+    return any(_is_sidecar(video.with_suffix(".json")) for video in files_with(path, VIDEO_SUFFIXES))
+
+
+def _is_sidecar(file: Path) -> bool:
+    """Whether a file exists and is not another JSON file of the camera, such as its calibration."""
+    if not file.is_file():
+        return False
+    try:
+        content = read_json(file)
+    except SequenceError:
+        return True  # Its error is reported when the session is read.
+    return isinstance(content, dict) and any(name.startswith(("frames", "timestamps")) for name in content)
 
 
 def _streams(path: Path, job: Import) -> list[_Stream]:
@@ -204,7 +215,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
             f"{path} has no kinematics: neither a bag with /PSM1/measured_cp or measured_js nor CSV files extracted "
             "from one (_PSM1_measured_js.csv). Also copy the folder of the bag."
         )
-    arms = [arm_from_log(log, job) for log in logs]
+    arms = [arm_from_log(log, job, float(times[0]), motion) for log in logs]
     latency, offset = max(stream.latency for stream in streams), job.options.time_offset
     if offset is None:
         offset = -latency

@@ -129,6 +129,11 @@ def _readable(file: Path) -> ForeignTable | None:
         return None
 
 
+def _is_text(file: Path) -> bool:
+    """Whether a file is certainly meant as a table of named columns."""
+    return file.suffix.lower() in (".csv", ".tsv", ".parquet")
+
+
 def _is_wide(table: ForeignTable) -> bool:
     """Whether a table with unknown columns may contain joints."""
     return len(table) > 1 and sum(values.dtype.kind in "iuf" for values in table.columns.values()) >= len(JOINT_NAMES)
@@ -139,22 +144,28 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
     options = job.options
     if options.kinematics == NO_TABLE:
         return []
-    if options.kinematics is not None or options.columns:
+    files = tables_of(path)
+    tables = [table for table in map(_readable, files) if table is not None]
+    chosen_in = [table for table in tables if set(options.columns.values()) <= table.columns.keys()]
+    if options.kinematics is not None or (options.columns and not chosen_in):
         table = kinematics_table(path, options)
         found = [] if table is None else [(table, guess_columns(table, options))]
     else:
-        tables = [table for table in map(_readable, tables_of(path)) if table is not None]
-        found = [(table, guess_columns(table, options)) for table in tables]
+        without = replace(options, columns={})
+        having = set(map(id, chosen_in))
+        found = [(table, guess_columns(table, options if id(table) in having else without)) for table in tables]
+        unreadable = [file for file in files if file not in {table.path for table in tables} and _is_text(file)]
         if not any(meanings.arms for _, meanings in found):
-            for file in tables_of(path):
-                if file.suffix.lower() in (".csv", ".tsv", ".parquet"):
-                    read_foreign_table(file)  # This raises the error of an unreadable table.
+            for file in unreadable:
+                read_foreign_table(file)  # This raises its error.
             found = [(table, meanings) for table, meanings in found if _is_wide(table)][:1]
+        for file in unreadable:
+            job.warning(f"{file} cannot be read, and is not used. To see why: --kinematics {file.name}.")
     known: dict[str, ForeignTable] = {}
     chosen = []
     for table, meanings in found:
         if not meanings.arms:
-            if options.kinematics is not None or options.columns or len(found) == 1:
+            if options.kinematics is not None or len(found) == 1:
                 raise PartError(
                     "columns",
                     f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which neither six "

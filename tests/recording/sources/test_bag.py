@@ -1,5 +1,6 @@
 """ROS bags, written by rosbags' own writers, from one command to images with joints and an overlay."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from recordings import (
     image,
     jaw_at,
     joints_at,
+    pose_of,
     write_bag,
     write_images,
 )
@@ -26,8 +28,11 @@ from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import CartsError
 from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.model.ecm_kinematics import forward as ecm
+from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
+from carts_core.recording.importing.found import Import, Track
 from carts_core.recording.importing.importer import find, import_recording
+from carts_core.recording.importing.logs import ArmLog, arm_from_log, track
 from carts_core.rendering import Renderer
 from carts_core.settings.interchange import ImportOptions
 
@@ -111,6 +116,48 @@ def test_an_endoscope_that_stands_still_is_a_camera_as_any_other(tmp_path: Path,
     file, found = import_recording(path, tmp_path / "out", ImportOptions())
     assert not Sequence.open(file).moving_cameras and not (tmp_path / "out" / "endoscope.csv").exists()
     assert any(str(note) == "the endoscope (ECM) is static." for note in found.notes)
+
+
+def test_poses_of_a_moving_endoscope_give_the_base_frame_at_the_first_image() -> None:
+    times = np.arange(100) / 50
+    mount = np.tile(np.eye(4), (len(times), 1, 1))
+    mount[:, :3, 3] = np.outer(np.sin(times), [0.02, 0.01, 0.03])
+    in_camera = T_DVRK_OPENCV @ np.linalg.inv(mount) @ T_CAMERA_BASE @ forward(joints_at(times))
+    poses = track(times, np.array([pose_of(T) for T in in_camera]))
+    motion, job = Track(times, mount), Import(ImportOptions())
+    for joints in (track(times, joints_at(times)), None):
+        local = None if joints else track(times, np.array([pose_of(T) for T in forward(joints_at(times))]))
+        arm = arm_from_log(ArmLog("PSM1", joints, poses=poses, local_poses=local), job, 0.0, motion)
+        assert arm.T_world_base is not None and np.allclose(arm.T_world_base, T_CAMERA_BASE, atol=1e-6)
+    assert not [note for note in job.notes if note.kind == "warning"]
+
+
+def test_signs_of_joints_can_be_changed_beside_a_jaw_topic(tmp_path: Path) -> None:
+    found = find(write_bag(tmp_path / "bag", BagKind(cameras=("left",))), ImportOptions(flip=("yaw",)))
+    expected = find(tmp_path / "bag").arms[0].values
+    values = found.arms[0].values
+    assert values is not None and expected is not None and np.allclose(values[:, 0], -expected[:, 0])
+
+
+def test_a_base_frame_of_another_arm_or_of_the_cart_is_a_warning(tmp_path: Path) -> None:
+    path, file = write_bag(tmp_path / "bag", BagKind(cameras=("left",))), tmp_path / "PSM2-registration-open-cv.json"
+    frame = {"reference-frame": "SUJ_Cart", "transform": T_CAMERA_BASE.tolist()}
+    file.write_text(json.dumps({"base-frame": frame}))
+    notes = [str(note) for note in find(path, ImportOptions(base={"PSM1": file})).notes if note.kind == "warning"]
+    assert any("has the base frame of PSM2" in note for note in notes)
+    assert any("is relative to SUJ_Cart, not to the camera" in note for note in notes)
+
+
+def test_a_given_calibration_replaces_an_unusable_camera_info(tmp_path: Path) -> None:
+    def fisheye(values: dict) -> None:
+        values["distortion_model"] = "equidistant"
+
+    path = write_bag(tmp_path / "bag", BagKind(cameras=("left",), info=fisheye))
+    with pytest.raises(CartsError, match="--calibration left FILE"):
+        find(path)
+    (tmp_path / "left.json").write_text(json.dumps({"K": K.tolist(), "D": [0, 0, 0, 0]}))
+    found = find(path, ImportOptions(calibration={"left": tmp_path / "left.json"}))
+    assert found.cameras[0].intrinsics == (110, 110, 47.5, 35.5)
 
 
 def test_a_bag_without_images_gets_those_of_a_video_beside_it(tmp_path: Path, capsys) -> None:

@@ -83,6 +83,15 @@ def test_a_sequence_of_endovis_has_its_cameras_and_no_arm_in_view(tmp_path):
     assert any("behind the camera" in str(note) for note in found.notes)
 
 
+def test_images_with_a_table_are_no_sequence_of_endovis(tmp_path):
+    path = endovis(tmp_path / "own")
+    (path / "camera_calibration.txt").unlink()
+    q, header = joints_at(np.arange(FRAMES) / 10), "q1,q2,q3,q4,q5,q6"
+    np.savetxt(path / "joints.csv", q, delimiter=",", header=header, comments="")
+    found = find(path)
+    assert found.kind == "a folder with images and a table" and len(found.arms) == 1
+
+
 def test_frames_of_1920_x_1080_lose_their_black_rim(tmp_path):
     folder = tmp_path / "seq_1/left_frames"
     folder.mkdir(parents=True)

@@ -117,6 +117,58 @@ def test_a_video_with_another_clock_gets_a_guessed_offset_that_is_said(tmp_path)
     assert np.abs(Sequence.open(file).frame(10).measured["PSM1"][:6] - joints_at(0.4)).max() < 1e-4
 
 
+def two_arms(folder: Path, header: str) -> None:
+    write_images(folder / "left", FRAMES)
+    times = np.arange(FRAMES) / 10
+    for arm in (1, 2):
+        names = ["timestamp", *(header.format(arm=arm, joint=joint) for joint in range(1, 7))]
+        write_csv(folder / f"psm{arm}.csv", names, np.column_stack([times, joints_at(times + arm)]))
+    write_csv(folder / "frames.csv", ["frame", "timestamp"], np.column_stack([np.arange(FRAMES), times]))
+
+
+def test_a_chosen_column_leaves_the_other_arms(tmp_path):
+    two_arms(tmp_path / "rec", "q{joint}")
+    for columns in ({}, {"time": "timestamp"}, {"yaw": "q1"}):
+        found = find(tmp_path / "rec", ImportOptions(columns=columns))
+        assert [arm.name for arm in found.arms] == ["PSM1", "PSM2"], columns
+
+
+def test_an_unreadable_table_beside_others_is_a_warning(tmp_path):
+    two_arms(tmp_path / "rec", "q{joint}")
+    with (tmp_path / "rec/psm2.csv").open("a") as stream:
+        stream.write("1.0,2.0\n")
+    found = find(tmp_path / "rec")
+    assert [arm.name for arm in found.arms] == ["PSM1"]
+    assert any("psm2.csv cannot be read, and is not used" in str(note) for note in found.notes)
+
+
+def test_names_of_arms_and_joints_may_be_one_word(tmp_path):
+    write_images(tmp_path / "rec/left", FRAMES)
+    q = [joints_at(np.arange(FRAMES) / 10 + arm) for arm in (1, 2)]
+    header = ["frame", *(f"PSM{arm}Joint{joint}" for arm in (1, 2) for joint in range(1, 7))]
+    write_csv(tmp_path / "rec/joints.csv", header, np.column_stack([np.arange(FRAMES), *q]))
+    arms = find(tmp_path / "rec").arms
+    assert [arm.name for arm in arms] == ["PSM1", "PSM2"]
+    for arm, expected in zip(arms, q, strict=True):
+        assert arm.values is not None and np.allclose(arm.values[:, :6], expected)
+
+
+def test_a_calibration_beside_a_video_is_no_sidecar_of_a_dvrk_session(tmp_path):
+    (tmp_path / "rec").mkdir()
+    write_video(tmp_path / "rec/left.mp4", [image(number) for number in range(FRAMES)])
+    (tmp_path / "rec/left.json").write_text(json.dumps({"K": K.tolist(), "D": [0, 0, 0, 0]}))
+    write_csv(tmp_path / "rec/log.csv", [f"q{n}" for n in range(6)], joints_at(np.arange(FRAMES) / 25))
+    found = find(tmp_path / "rec")
+    assert found.arms and found.cameras[0].intrinsics == (110, 110, 47.5, 35.5)
+
+
+def test_arrays_of_different_lengths_are_named(tmp_path):
+    write_images(tmp_path / "rec/left", FRAMES)
+    np.savez(tmp_path / "rec/log.npz", time=np.arange(3), joints=joints_at(np.arange(FRAMES) / 10))
+    with pytest.raises(CartsError, match=r"different numbers of rows \(time 3, joints_1 5"):
+        find(tmp_path / "rec", ImportOptions(kinematics=Path("log.npz")))
+
+
 def test_numpy_arrays_of_joint_states_are_read(tmp_path):
     write_images(tmp_path / "rec/images", FRAMES)
     q = joints_at(np.arange(FRAMES) / 10)

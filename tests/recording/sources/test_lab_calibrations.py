@@ -219,6 +219,72 @@ def test_matlab_files_count_pixels_as_their_programs_do(tmp_path: Path, write: C
     assert camera.intrinsics == pytest.approx((700, 705, 330, 235))
 
 
+FLAT = dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("flat.json", lambda path: path.write_text(json.dumps({"K": K.tolist(), **FLAT}))),
+        ("named.json", lambda path: path.write_text(json.dumps({"K": K.tolist(), "distortion": FLAT}))),
+        ("tutorial.yml", lambda path: path.write_text(opencv_yaml().replace("distortion_coefficients", "dist_coeff"))),
+        ("Calib_Results.mat", lambda path: savemat(path, {"KK": K, "fc": K[[0, 1], [0, 1]], "cc": K[:2, 2], "kc": D})),
+    ],
+)
+def test_distortion_is_read_under_all_its_names(tmp_path: Path, name: str, write: Callable[[Path], None]) -> None:
+    write(tmp_path / name)
+    (camera,) = imported(tmp_path, {"left": tmp_path / name}).cameras
+    assert camera.distortion == pytest.approx(tuple(D))
+
+
+def test_a_calibration_without_distortion_is_remarked(tmp_path: Path) -> None:
+    (tmp_path / "own.json").write_text(json.dumps({"K": K.tolist()}))
+    assert "has no distortion coefficients; none are assumed" in said(
+        imported(tmp_path, {"left": tmp_path / "own.json"})
+    )
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [("m", 1000.0), ("cm", 10.0), ("millimeters", 1.0)])
+def test_baselines_of_matlab_have_the_units_of_the_file(tmp_path: Path, unit: str, millimetres: float) -> None:
+    own = {"K": K, "RadialDistortion": np.array(D[:2]), "WorldUnits": unit}
+    pair = {"CameraParameters1": own, "CameraParameters2": own, "RotationOfCamera2": np.eye(3)}
+    T = np.array([-5.0, 0.0, 0.0]) / millimetres
+    savemat(tmp_path / "stereo.mat", {"stereoParams": {**pair, "TranslationOfCamera2": T}})
+    found = imported(tmp_path, dict.fromkeys(("left", "right"), tmp_path / "stereo.mat"))
+    assert found.cameras[1].T_camera_world is not None
+    assert found.cameras[1].T_camera_world[:3, 3] == pytest.approx([-0.005, 0, 0])
+    assert "5.00 mm from left, given by its calibration" in said(found)
+
+
+def test_an_unusual_baseline_is_a_warning(tmp_path: Path) -> None:
+    pair = {"M1": K.tolist(), "M2": K.tolist(), "D1": D, "D2": D, "R": np.eye(3).tolist(), "T": [-0.5, 0, 0]}
+    (tmp_path / "stereo.json").write_text(json.dumps(pair))
+    found = imported(tmp_path, dict.fromkeys(("left", "right"), tmp_path / "stereo.json"))
+    assert "a baseline of 500 mm is unusual for a stereo endoscope" in said(found)
+
+
+@pytest.mark.parametrize("names", [("cam0", "cam1"), ("camera1", "camera2"), ("scope_a", "scope_b")])
+def test_the_second_of_two_cameras_gets_the_second_calibration(tmp_path: Path, names: tuple[str, str]) -> None:
+    pose = "  T_cn_cnm1: [[1, 0, 0, -0.005], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    second = KALIBR.replace("cam0", "cam1").replace("700", "720") + pose
+    (tmp_path / "camchain.yaml").write_text(KALIBR + second)
+    first, other = imported(tmp_path, dict.fromkeys(names, tmp_path / "camchain.yaml")).cameras
+    assert first.intrinsics is not None and other.intrinsics is not None
+    assert (first.intrinsics[0], other.intrinsics[0]) == (700, 720) and other.T_camera_world is not None
+
+
+def test_a_dump_of_camera_info_rectifies_images_that_are_called_rectified(tmp_path: Path) -> None:
+    _, _, R1, _, P1, _ = stereo_pair()
+    dump = {"K": K.reshape(-1).tolist(), "D": D, "R": R1.reshape(-1).tolist(), "P": P1.reshape(-1).tolist()}
+    (tmp_path / "info.json").write_text(json.dumps({**dump, "distortion_model": "plumb_bob"}))
+    raw, rectified = imported(tmp_path, dict.fromkeys(("left", "right_rect"), tmp_path / "info.json")).cameras
+    assert raw.intrinsics == pytest.approx((700, 705, 330, 235)) and raw.distortion
+    assert rectified.intrinsics == pytest.approx(tuple(P1[[0, 1, 0, 1], [0, 1, 2, 2]])) and not rectified.distortion
+    (tmp_path / "own.json").write_text(json.dumps(OWN))
+    found = imported(tmp_path, {"left_rect": tmp_path / "own.json"})
+    assert "indicate rectified images, but" in said(found) and "has no projection matrix P" in said(found)
+
+
 def test_a_matlab_calibration_of_another_size_is_scaled_and_said_or_refused(tmp_path: Path) -> None:
     matlab(tmp_path / "camera.mat")
     found = imported(tmp_path, {"left": tmp_path / "camera.mat"}, size=(320, 240))
