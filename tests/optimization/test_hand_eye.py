@@ -135,6 +135,20 @@ def test_the_reference_camera(scene: Scene, measured: dict[str, np.ndarray], fre
     assert np.abs(right @ np.linalg.inv(left) - scene.cameras[1].T_camera_world).max() < 1e-6
 
 
+def test_no_base_frame_is_computed_from_an_unknown_camera_pose(scene: Scene, measured: dict[str, np.ndarray]) -> None:
+    # The second arm is visible in the free camera alone, with more points than the first one.
+    points = clicked(scene.with_arms(["PSM1"]), measured, range(3), ["left"], noise=0.0)
+    points += clicked(scene.with_arms(["PSM1"]), measured, range(2), ["right"], noise=0.0)
+    points += clicked(scene.with_arms(["PSM2"]), measured, range(4), ["right"], noise=0.0)
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_rotvec([0.0, 2.0, 1.0]).as_matrix()
+    start = unknown(scene)
+    start = replace(start, cameras=(start.cameras[0], replace(start.cameras[1], T_camera_world=turned)))
+    result = solve_hand_eye(start, measured, points, HandEyeSettings(free_cameras=("right",)))
+    for arm in scene.arms:
+        assert np.abs(result.scene.arm(arm.name).T_world_base - arm.T_world_base).max() < 1e-6
+
+
 def test_the_focal_length_is_estimated_on_request(scene: Scene, measured: dict[str, np.ndarray]) -> None:
     one = scene.with_arms(["PSM1"])
     views = tuple(replace(view, intrinsics=(1.4 * FOCAL, 1.4 * FOCAL, 325.0, 236.0)) for view in one.cameras)

@@ -71,6 +71,11 @@ class View:
         """Mask of the point landmarks, as opposed to lines [points]."""
         return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
 
+    @property
+    def points(self) -> int:
+        """Number of point landmarks."""
+        return int(self.is_point.sum())
+
     @cached_property
     def _radii(self) -> np.ndarray:
         """Radius of the shaft for edges [m], NaN for axes [lines]."""
@@ -277,9 +282,13 @@ class HandEyeProblem:
         """Initialize base frames from the view with the most points, then poses of free cameras."""
         self._anchor = _anchor(views, free)
         unknown = free - {self._anchor}
-        # Known cameras come first, since base frames in their view determine the poses of free cameras.
-        for view in sorted(views, key=lambda view: (view.camera in unknown, -int(view.is_point.sum()))):
-            count = int(view.is_point.sum())
+        remaining = list(views)
+        while remaining:
+            # Known cameras come first, since base frames in their view determine the poses of free cameras; then known
+            # arms, since a base frame must not be computed from an unknown camera pose.
+            keys = [(view.camera in unknown, view.arm not in self._T_world_base, -view.points) for view in remaining]
+            view = remaining.pop(keys.index(min(keys)))
+            count = view.points
             known = view.arm in self._T_world_base
             if (known and view.camera not in unknown) or count < MIN_POINTS:
                 if count < MIN_POINTS and (not known or view.camera in unknown):
@@ -371,6 +380,6 @@ def _anchor(views: list[View], free: set[int]) -> int:
     camera has enough points."""
     points: dict[int, int] = {}
     for view in views:
-        if (count := int(view.is_point.sum())) >= MIN_POINTS:
-            points[view.camera] = points.get(view.camera, 0) + count
+        if view.points >= MIN_POINTS:
+            points[view.camera] = points.get(view.camera, 0) + view.points
     return max(points, key=lambda camera: (camera not in free, points[camera], -camera), default=-1)
