@@ -389,7 +389,7 @@ class OptimizeRun:
             self._solve_frames(todo, part, now)
         elif todo:
             # Every frame depends on all other frames, so a missing frame requires solving all frames again.
-            self._solve_sequence(part, now, common)
+            self._solve_sequence(part, now)
         else:
             # The checkpoint remains if the process was killed after the last result.
             remove_file(output.checkpoint)
@@ -459,8 +459,11 @@ class OptimizeRun:
             *verdict_hints(part.name, assessed),
         )
 
-    def _solve_sequence(self, part: _Part, origins: Mapping[int, InputHashes], common: InputHashes) -> None:
-        made_with = fingerprint(json.dumps(self._result_settings()), json.dumps(dict(common)))
+    def _solve_sequence(self, part: _Part, origins: Mapping[int, InputHashes]) -> None:
+        # Joints and images are part of the keys of the measurements; given masks are not.
+        inputs = origins[self._frames[0]].items()
+        common = {kind: value for kind, value in inputs if kind not in ("joints", "images")}
+        made_with = fingerprint(json.dumps(self._result_settings()), json.dumps(common))
         checkpoint = sequence_checkpoint(part.output.checkpoint, made_with)
         optimizer = part.setup.sequence_optimizer(self._frames, keyframes=self._keyframes, checkpoint=checkpoint)
         self._running = optimizer

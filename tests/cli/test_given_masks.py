@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from carts_core.cli.command_line import main
+from carts_core.cli.optimizing import FrameFolder
+from carts_core.errors import SettingsError
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.project import IgnoreRegion, Key, MaskCorrection, Project
 from carts_core.recording import Sequence
@@ -106,6 +108,27 @@ def test_masks_of_a_folder_are_fitted_and_are_the_truth_where_the_recording_has_
     assert found["observed"] == "masks" and found["masks"] == str(theirs)
     assert found["mean"]["dice_before"] < 0.95 and found["mean"]["dice_after"] > 0.97
     assert f"If the recording has no masks, {CAUTION}" in said()
+
+
+@pytest.mark.usefixtures("no_network")
+def test_a_stopped_run_is_not_resumed_with_measurements_of_other_masks(
+    sequence: Path, theirs: Path, tmp_path: Path, said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise SettingsError("stopped")
+
+    options = ["--observe", "masks", "--masks", str(theirs), "--mode", "sequence", "--settings", "iterations=2"]
+    command = ["optimize", str(sequence), *options, "--output", str(tmp_path / "out")]
+    for changed in (False, True):
+        with monkeypatch.context() as patch, pytest.raises(SystemExit):
+            patch.setattr(FrameFolder, "write", stopped)
+            main([*command, "--overwrite"])
+        if changed:
+            mask = 255 * read_mask(theirs / "002.png").astype(np.uint8)
+            mask[:40] = 0
+            assert cv2.imwrite(str(theirs / "002.png"), mask)
+        main([*command, "--overwrite"])
+        assert ("resumed an earlier run" in said()) is not changed
 
 
 @pytest.mark.usefixtures("no_network")
