@@ -26,7 +26,7 @@ class GivenMasks:
     """Frame index -> camera name -> unlabelled pixels, which are not compared."""
 
     def filled(self, frame: Frame) -> Frame:
-        """Copy of the frame with these masks for cameras without recorded masks."""
+        """Copy of the frame with these masks for those of its cameras without recorded masks."""
         masks = {**self.masks(frame.index), **(frame.masks or {})}
-        whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items()}
+        whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items() if name in frame.images}
         return replace(frame, masks=whole or None)

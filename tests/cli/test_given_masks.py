@@ -142,6 +142,17 @@ def test_a_calibration_fits_imported_masks(sequence: Path, theirs: Path, tmp_pat
     assert after > before and after > 0.95
 
 
+@pytest.mark.usefixtures("no_network")
+def test_one_of_two_cameras_with_imported_masks_is_calibrated(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, said: Said
+) -> None:
+    path = tiny_sequence(frames=2, cameras=("left", "right"), masks=False, **SIZE)
+    main(["import-masks", str(path), str(path.parent / "masks")])
+    options = ["--camera", "left", "--observe", "masks", "--masks", "imported", "--settings", "iterations=2"]
+    main(["calibrate", str(path), *options, "--output", str(tmp_path / "out")])
+    assert "left: mean Dice" in (text := said()) and "right: mean Dice" not in text
+
+
 def test_painted_masks_are_fitted_and_frames_without_one_are_named_or_left_to_the_network(
     sequence: Path, theirs: Path, refused: Refused
 ) -> None:
