@@ -85,14 +85,10 @@ class HandEye:
                 f"no frame has a mask for camera {camera!r}. Give other masks, or click points: --points."
             )
         chosen = [known[n] for n in evenly_spaced(len(known), _MASKED_FRAMES)]
-        frames = [observer.completed(sequence.frame(n, cameras=[camera])) for n in chosen]
-        found = pose_from_masks(
-            sequence.scene,
-            arm,
-            camera,
-            sequence.measured[arm][chosen],
-            [frame.masks[camera] for frame in frames if frame.masks is not None],
-        )
+        given = observer.given
+        seen = [sequence.frame(n, cameras=[camera]).masks or {} if given is None else given.masks(n) for n in chosen]
+        whole = [found[camera] >= 0.5 for found in seen]
+        found = pose_from_masks(sequence.scene, arm, camera, sequence.measured[arm][chosen], whole)
         scene = placed(sequence.scene, arm, camera, found.T_camera_base)
         output = output_folder(self.output, sequence.name, "hand_eye")
         with published(output, overwrite=self.overwrite) as folder:

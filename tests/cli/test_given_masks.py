@@ -143,6 +143,17 @@ def test_a_calibration_fits_imported_masks(sequence: Path, theirs: Path, tmp_pat
 
 
 @pytest.mark.usefixtures("no_network")
+def test_a_hand_eye_calibration_from_given_masks_ignores_those_of_the_recording(
+    masked: Path, tmp_path: Path, said: Said
+) -> None:
+    given = shutil.copytree(masked.parent / "masks" / "left", tmp_path / "given")
+    for file in (masked.parent / "masks" / "left").iterdir():
+        assert cv2.imwrite(str(file), np.zeros((128, 160), np.uint8))
+    main(["hand-eye", str(masked), "--masks", str(given), "--output", str(tmp_path / "out")])
+    assert "with the masks of 2 frames" in said()
+
+
+@pytest.mark.usefixtures("no_network")
 def test_one_of_two_cameras_with_imported_masks_is_calibrated(
     tiny_sequence: Callable[..., Path], tmp_path: Path, said: Said
 ) -> None:
