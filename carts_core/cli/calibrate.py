@@ -120,12 +120,13 @@ class HandEye:
         points = read_points(self.points, sequence)
         mounts = mounts_of_points(sequence, points)
         result = solve_hand_eye(moved_cameras(sequence.scene, mounts), sequence.measured, points, settings)
+        # Written poses of arms in cameras are those at the time of the points.
+        content = result_json(sequence, points, result, self.free_cameras)
         result = replace(result, scene=moved_cameras(result.scene, mounts, back=True))
         output = output_folder(self.output, sequence.name, "hand_eye")
         with published(output, overwrite=self.overwrite) as folder:
             text = calibrated_sequence_file(sequence.path, output.path, sequence.scene, result.scene, "hand-eye")
             write_text(folder / "sequence.toml", text)
-            content = result_json(sequence, points, result, self.free_cameras)
             write_text(folder / RESULT_FILE, json.dumps(content, indent=1))
             write_text(folder / MARKER, json.dumps({"format": "hand-eye", "sequence": str(self.sequence)}, indent=1))
         _print(console, sequence, points, result)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clicked_points import clicked
+from moving import Motion, let_camera_move, swing
 from scipy.spatial.transform import Rotation
 from tiny import tiny_scene
 
@@ -16,7 +17,13 @@ from carts_core.errors import RobotError, SettingsError
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
-from carts_core.optimization.hand_eye import HandEyeSettings, ImagePoint, agreement_with_points, solve_hand_eye
+from carts_core.optimization.hand_eye import (
+    HandEyeSettings,
+    ImagePoint,
+    agreement_with_points,
+    moved_cameras,
+    solve_hand_eye,
+)
 from carts_core.recording import Sequence
 
 FRAMES = 6
@@ -231,6 +238,22 @@ def test_the_command_reads_a_table_and_writes_a_sequence_file(
         main(["hand-eye", str(path), "--points", str(table), "--output", str(tmp_path / "other")])
     assert "has no column 'arm'" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "other").exists()
+
+
+def test_written_poses_of_a_moving_camera_are_those_at_the_time_of_the_points(
+    tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    Ts = swing(4, 3.0, 0.002).Ts_world_mount
+    path = let_camera_move(tiny_sequence(frames=4, width=320, height=240), Motion(Ts[[0, 1, 1, 1]]))
+    sequence = Sequence.open(path)
+    there = moved_cameras(sequence.scene, sequence.mounts(1))
+    write_points(tmp_path / "points.csv", sequence, clicked(there, sequence.measured, (1, 2, 3), ["left"], noise=0.0))
+    main(["hand-eye", str(path), "--points", str(tmp_path / "points.csv"), "--output", str(tmp_path / "out")])
+    (pose,) = json.loads((tmp_path / "out/hand_eye.json").read_text())["poses"]
+    assert np.allclose(pose["T_camera_base"], there.cameras[0].T_camera_world @ there.arms[0].T_world_base, atol=1e-5)
+    after = Sequence.open(tmp_path / "out/sequence.toml").scene
+    assert np.allclose(after.cameras[0].T_camera_world, sequence.scene.cameras[0].T_camera_world, atol=1e-9)
+    assert np.allclose(after.arms[0].T_world_base, sequence.scene.arms[0].T_world_base, atol=1e-5)
 
 
 def test_edges_that_were_all_clicked_on_one_side_are_tried_on_both_sides_of_the_shaft(shipped_psm: Robot) -> None:
