@@ -55,7 +55,10 @@ def frame_residuals(sequence: Sequence, frames: Frames[Frame], result: Calibrati
 
 def _overlap(scene: Scene, frame: Frame, renderers: dict[str, Renderer]) -> dict[str, float]:
     masks, state = frame.masks or {}, scene.state(frame.measured, mounts=frame.mounts)
-    return {camera: dice(renderers[camera].segment(state)[0] >= 0, mask) for camera, mask in masks.items()}
+    return {
+        camera: dice(renderers[camera].segment(state)[0] >= 0, mask, frame.unlabelled.get(camera))
+        for camera, mask in masks.items()
+    }
 
 
 def mean_dice(residuals: Frames[FrameResidual], camera: str) -> tuple[float, float] | None:

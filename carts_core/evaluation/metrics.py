@@ -9,8 +9,12 @@ from jaxtyping import Bool, Float
 from ..model.scene import Arm, Scene
 
 
-def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
-    """Dice score of two masks in [0, 1]; 1 if both are empty."""
+def dice(
+    a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"], ignored: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """Dice score of two masks in [0, 1], without ignored pixels; 1 if both are empty."""
+    if ignored is not None:
+        a, b = a & ~ignored, b & ~ignored
     total = int(a.sum()) + int(b.sum())
     return 1.0 if total == 0 else 2.0 * int((a & b).sum()) / total
 

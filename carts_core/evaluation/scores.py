@@ -164,7 +164,9 @@ def frame_score(
     mask, assessment = (frame.masks or {}).get(camera), found.assessment
 
     def overlap(state: SceneState) -> float | None:
-        return None if mask is None else dice(renderer.segment(state)[0] >= 0, mask)
+        if mask is None:
+            return None
+        return dice(renderer.segment(state)[0] >= 0, mask, frame.unlabelled.get(camera))
 
     def mae(estimate: Joints) -> float | None:
         return joint_mae_deg(sequence.scene, estimate, frame.truth or {}, sequence.measured_joints)

@@ -27,6 +27,8 @@ class GivenMasks:
 
     def filled(self, frame: Frame) -> Frame:
         """Copy of the frame with these masks for those of its cameras without recorded masks."""
-        masks = {**self.masks(frame.index), **(frame.masks or {})}
+        recorded = frame.masks or {}
+        masks = {**self.masks(frame.index), **recorded}
         whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items() if name in frame.images}
-        return replace(frame, masks=whole or None)
+        unlabelled = {name: pixels for name, pixels in self.ignored(frame.index).items() if name not in recorded}
+        return replace(frame, masks=whole or None, unlabelled=unlabelled)

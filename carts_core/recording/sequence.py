@@ -49,6 +49,8 @@ class Frame:
     """Camera -> T_mount_world [m], for moving cameras."""
     missing: tuple[str, ...] = ()
     """Cameras without an image of this frame; their entries of `images` are black, and the solvers ignore them."""
+    unlabelled: dict[str, Bool[np.ndarray, "height width"]] = field(default_factory=dict)
+    """Camera -> pixels whose label in `masks` is unknown, which scores leave out."""
 
     def ignoring(
         self, ignore: Mapping[str, Bool[np.ndarray, "height width"]] | None

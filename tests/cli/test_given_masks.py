@@ -143,6 +143,22 @@ def test_a_calibration_fits_imported_masks(sequence: Path, theirs: Path, tmp_pat
 
 
 @pytest.mark.usefixtures("no_network")
+def test_unlabelled_pixels_of_given_masks_are_not_scored(
+    sequence: Path, theirs: Path, tmp_path: Path, said: Said
+) -> None:
+    for file in theirs.iterdir():
+        mask = 255 * read_mask(file).astype(np.uint8)
+        mask[:, np.median(np.nonzero(mask)[1]).astype(int) :] = 9
+        assert cv2.imwrite(str(file), mask)
+    (theirs / "labels.json").write_text('{"tool": 255, "ignore": 9}')
+    options = ["--observe", "masks", "--masks", str(theirs)]
+    assert scores(sequence, *options, "--frames", "001")["mean"]["dice_after"] > 0.95
+    said()
+    main(["calibrate", str(sequence), *options, "--settings", "iterations=2", "--output", str(tmp_path / "out")])
+    assert min(float(word) for word in said().split("mean Dice ")[1].split()[0:3:2]) > 0.8
+
+
+@pytest.mark.usefixtures("no_network")
 def test_a_hand_eye_calibration_from_given_masks_ignores_those_of_the_recording(
     masked: Path, tmp_path: Path, said: Said
 ) -> None:
