@@ -110,6 +110,11 @@ class Keyframes:
     def __len__(self) -> int:
         return len(self._positions)
 
+    @property
+    def exact(self) -> set[int]:
+        """Keyframes without a positive standard deviation; the others are estimates from images."""
+        return {index for index in self if not any((std > 0).any() for std in self._deviations(index).values())}
+
     def correction(self, index: int, variables: Variables) -> tuple[Float[np.ndarray, " n"], Information]:
         """Correction of a frame's measured values, NaN for unknowns other than joints, and its information."""
         given, std = self._positions[index], self._deviations(index)
@@ -162,7 +167,7 @@ class SequenceOptimizer:
         model: model of the measurement error, direction and stages.
         keyframes: frame index -> arm name -> manually set joint positions [rad, m].
         keyframe_std: frame index -> arm name -> standard deviations [rad, m] of keyframes that are accepted optimizer
-            results. Other keyframes, and NaN values, count as exact.
+            results, which share the errors of images close in time. Other keyframes, and NaN values, count as exact.
         ignore: frame index -> camera name -> pixels that show an occluder; none by default.
         backgrounds: mean backgrounds of the cameras, in which detections are false positives.
         cameras: names of the cameras to use, all by default.
@@ -219,7 +224,7 @@ class SequenceOptimizer:
         )
         errors = ErrorModel(self.model, expected.cpu().double().numpy())
         self._prior = errors.correction(errors.initial())
-        self._smoother = Smoother(errors, gaps, self.model.correlation_seconds, self._keyframes)
+        self._smoother = Smoother(errors, gaps, self.model.correlation_seconds, self._keyframes.exact)
         self._visits: dict[int, Visit] = {}
         self._revisits: list[tuple[int, Gaussian]] | None = None
         self._estimates: dict[int, FrameEstimate] | None = None
