@@ -461,10 +461,12 @@ class SequenceOptimizer:
         return frame, Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:
-        """Frames with `Origin.CARRIED` or a measurement that contradicts the smoothed correction, with the prediction
-        from the other frames."""
+        """Frames with `Origin.CARRIED` or a measurement that contradicts the smoothed correction, except keyframes,
+        with the prediction from the other frames."""
         chosen = []
         for index, smoothed in self._smoother.smoothed().items():
+            if index in self._keyframes:
+                continue
             visit = self._visits[index]
             certain = Gaussian(smoothed.mean, np.zeros_like(smoothed.covariance))
             if visit.start is Origin.CARRIED or visit.measurement.information.contradicts(certain):

@@ -154,6 +154,14 @@ def test_keyframes_without_a_deviation_are_exact(truths: Truths) -> None:
     assert Keyframes(truths.sequence.scene, given, std).exact == {0, 1, 2}
 
 
+def test_a_keyframe_that_the_other_frames_contradict_is_not_visited_again(truths: Truths) -> None:
+    given = {2: {ARM: truths.sequence.frame(2).measured[ARM] + 0.1}}
+    sequence = optimizer(truths, model=ALONE, keyframes=given, keyframe_std={2: {ARM: np.full(7, 5e-3)}})
+    list(sequence)
+    assert sequence.estimates[2].start == "keyframe"
+    assert np.array_equal(sequence.estimates[2].joint_positions[ARM], given[2][ARM])
+
+
 def test_cancelling_keeps_what_is_there(truths: Truths) -> None:
     sequence = optimizer(truths, model=ALONE)
     sequence.step()
