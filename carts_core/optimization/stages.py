@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from typing import Any, Protocol
@@ -335,7 +336,7 @@ def run_retry_other_background(stage: RetryOtherBackground, fit: Fit) -> Iterato
     known = assess(before)
     if before.overlap_with_change is None or known.verdict is not Verdict.FAILED or known.nothing_there:
         return
-    first_run = fit.offsets, fit.best_of_descent, fit.edges, fit.stop_reason
+    first_run = copy(fit)
     observation = problem.observation
     problem.toggle_background_mode()
     fit.start_over(problem.start)
@@ -346,7 +347,7 @@ def run_retry_other_background(stage: RetryOtherBackground, fit: Fit) -> Iterato
     if not better:
         problem.toggle_background_mode()
         problem.observation = observation
-        fit.offsets, fit.best_of_descent, fit.edges, fit.stop_reason = first_run
+        vars(fit).update(vars(first_run))
 
 
 @run_stage.register

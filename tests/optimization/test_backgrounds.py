@@ -18,7 +18,7 @@ from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor,
 from carts_core.optimization.observation import Background, FrameImages, without_background
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_core.settings.stages import RetryOtherBackground
+from carts_core.settings.stages import Descend, Observe, RetryOtherBackground
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
 SIZE = {"width": 320, "height": 240}
@@ -151,12 +151,13 @@ ASIDE = 24
 
 
 class SeesArmsAsideBeforeRooms(ImagePredictor):
-    """Sees nothing in the empty room, arms aside of where they are before it, and in place before a blurred one."""
+    """Sees nothing in the empty room, and arms aside of where they are before it; in place before a blurred one, or
+    `blurred` pixels aside."""
 
     device, stride = torch.device("cpu"), 16
 
-    def __init__(self, parts: torch.Tensor) -> None:
-        self.parts = parts
+    def __init__(self, parts: torch.Tensor, blurred: int = 0) -> None:
+        self.parts, self.blurred = parts, blurred
         """Coverage of every part [1, parts, height, width]."""
 
     def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
@@ -167,13 +168,14 @@ class SeesArmsAsideBeforeRooms(ImagePredictor):
         mask = parts[0].sum(0)
         if float(images[..., mask > 0.9].mean()) < 0.2:
             before_nothing = float(images[:, 0, :8, :8].std()) < 0.02
-            found[:, COVERAGE] = parts if before_nothing else parts.roll(ASIDE * size[1] // SIZE["width"], -1)
+            aside = self.blurred if before_nothing else ASIDE
+            found[:, COVERAGE] = parts.roll(aside * size[1] // SIZE["width"], -1)
         return window.of(found)
 
 
-@pytest.mark.parametrize("again", [True, False])
-def test_the_fit_that_overlaps_more_with_the_change_is_kept(tiny_sequence: Callable[..., Path], again: bool) -> None:
-    sequence = Sequence.open(tiny_sequence(frames=1, **SIZE))
+def before_a_room(path: Path, settings: SurfaceSolver, blurred: int = 0) -> tuple[FrameOptimizer, Renderer, np.ndarray]:
+    """Finished optimizer of a dark arm before a room, its renderer, and the true mask."""
+    sequence = Sequence.open(path)
     scene, frame = sequence.scene.with_cameras(["left"]), sequence.frame(0, cameras=["left"])
     assert frame.truth is not None
     renderer = Renderer(scene)
@@ -182,20 +184,40 @@ def test_the_fit_that_overlaps_more_with_the_change_is_kept(tiny_sequence: Calla
     room = rng.integers(70, 130, (SIZE["height"], SIZE["width"], 3)).astype(np.uint8)
     image = room.copy()
     image[mask] = 10
-    settings = SurfaceSolver()
-    if not again:
-        settings = replace(
-            settings, stages=tuple(s for s in settings.stages if not isinstance(s, RetryOtherBackground))
-        )
     optimizer = FrameOptimizer(
         scene,
         replace(frame, images={"left": image}),
         {"left": room},
-        SeesArmsAsideBeforeRooms(renderer.surface_maps(scene.state(frame.truth))[:, COVERAGE]),
+        SeesArmsAsideBeforeRooms(renderer.surface_maps(scene.state(frame.truth))[:, COVERAGE], blurred),
         settings=settings,
         live=False,
     )
     list(optimizer)
+    return optimizer, renderer, mask
+
+
+FIRST_RUN = tuple(stage for stage in SurfaceSolver().stages if not isinstance(stage, RetryOtherBackground))
+
+
+def test_a_rejected_retry_changes_nothing_even_if_it_uses_all_evaluations(
+    tiny_sequence: Callable[..., Path],
+) -> None:
+    path, found = tiny_sequence(frames=1, **SIZE), []
+    # Without `RejectFailed`, which would return to the start.
+    *fitted, evaluate, _ = FIRST_RUN
+    long = RetryOtherBackground(then=(Observe(), *20 * (Descend(3.0), Descend(1.5))))
+    for stages in ((*fitted, evaluate), (*fitted, long, evaluate)):
+        optimizer, _, _ = before_a_room(path, replace(SurfaceSolver(), stages=stages), 2 * ASIDE)
+        assert optimizer.best is not None
+        found.append((len(optimizer.history), optimizer.best.joint_positions()["PSM1"], optimizer.stop_reason))
+    (first, *once), (with_retry, *both) = found
+    assert with_retry > first and np.array_equal(once[0], both[0]) and once[1] == both[1]
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_the_fit_that_overlaps_more_with_the_change_is_kept(tiny_sequence: Callable[..., Path], again: bool) -> None:
+    settings = SurfaceSolver() if again else replace(SurfaceSolver(), stages=FIRST_RUN)
+    optimizer, renderer, mask = before_a_room(tiny_sequence(frames=1, **SIZE), settings)
     assert optimizer.best is not None and optimizer.assessment is not None
     found = dice(renderer.segment(optimizer.best.state)[0] >= 0, mask)
     assert (optimizer.assessment.verdict is Verdict.GOOD) == again
