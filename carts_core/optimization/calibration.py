@@ -146,7 +146,8 @@ class CalibrationResult:
     beyond: tuple[str, ...] = ()
     """Arms whose base frame has moved farther than its known covariance allows."""
     deviations: Mapping[tuple[str, str], PoseDeviation] = field(default_factory=dict)
-    """(arm, camera) -> standard deviations of the arm's pose relative to that camera, at the mean tip position."""
+    """(arm, camera) -> standard deviations of the arm's pose relative to that camera in the first frame, at the mean
+    tip position."""
 
     __repr__ = short_repr
 
@@ -361,14 +362,15 @@ class CalibrationOptimizer:
     def _pose_deviations(
         self, offsets: torch.Tensor, covariance: Float[np.ndarray, "n n"]
     ) -> dict[tuple[str, str], PoseDeviation]:
-        """Standard deviations of each arm's pose relative to each camera, by central differences."""
+        """Standard deviations of each arm's pose relative to each camera, by central differences; a moving camera is
+        that of the first frame."""
         around = self.variables.around(offsets)
         found = {}
         for number, arm in enumerate(self._scene.arms):
             joints = np.stack([frame.measured[arm.name] for frame in self._frames])
             middle = arm.robot.forward_kinematics(joints)[:, -1, :, 3].mean(0)
             for index, camera in enumerate(self._scene.cameras):
-                Ts = (around.T_camera_world[:, index] @ around.T_world_base[:, number]).double().cpu().numpy()
+                Ts = (around.T_view_world[:, index] @ around.T_world_base[:, number]).double().cpu().numpy()
                 turns = Rotation.from_matrix(Ts[:, :3, :3] @ Ts[0, :3, :3].T).as_rotvec()
                 below, above = np.split(np.hstack([turns, Ts[:, :3] @ middle])[1:], 2)
                 J = (above - below).T / DIFFERENCE_SPAN

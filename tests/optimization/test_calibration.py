@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -253,6 +253,21 @@ def test_the_first_camera_stays_where_only_products_can_be_seen(sequence: Sequen
     for held in ({"base_frames": False}, {"extrinsics": False}, {"locked_cameras": ("right",)}):
         free = replace(CALIBRATION, **held)
         assert with_fixed_gauge(scene, free) == free
+
+
+def test_pose_deviations_do_not_depend_on_where_a_camera_is_mounted(
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
+) -> None:
+    scene, T_mount_world = sequence.scene, rigid([0.0, 90.0, 20.0], [50.0, 0.0, 20.0])
+    cameras = (replace(one, T_camera_world=one.T_camera_world @ np.linalg.inv(T_mount_world)) for one in scene.cameras)
+    mounts = {camera.name: T_mount_world for camera in scene.cameras}
+    mounted = replace(scene, cameras=tuple(cameras)), [replace(frame, mounts=mounts) for frame in frames[:3]]
+    found = []
+    for given in ((scene, frames[:3]), mounted):
+        optimizer = CalibrationOptimizer(*given, predictor, settings=replace(SETTINGS, stages=(FAR, Descend(2.0))))
+        list(optimizer)
+        found.append(optimizer.result().deviations["PSM1", "left"])
+    assert astuple(found[0]) == pytest.approx(astuple(found[1]), rel=0.02)
 
 
 def test_cancelling_keeps_the_best(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
