@@ -24,6 +24,7 @@ from ..recording.importing.columns import ColumnMeanings, arm_in, guess_columns
 from ..recording.importing.foreign_tables import DECIMAL_COMMAS, ForeignTable, delimiter_of, read_foreign_table
 from ..recording.importing.found import Import
 from ..recording.importing.row_matching import row_seconds
+from ..recording.matching import at_times
 from ..recording.sources.folder import tables_of
 from ..settings.interchange import ImportOptions
 from .dataset import Dataset, ExportFrame, ExportProgress
@@ -180,8 +181,9 @@ def _by_time(
     if not own:
         return _RowResults(positions, std, nearest >= 0, nearest)
     at = np.array([timestamps[frames[number].index] for number in own]) + sequence.checked_matching().time_offset
-    logged = sequence.logged_at(at).joints[arm]
-    corrections = np.stack([frames[number].joint_positions[arm] for number in own]) - logged
+    # A frame shortly before the first row, or after the last one, has the values of that row.
+    at = np.clip(at, times[0], times[-1])
+    corrections = np.stack([frames[number].joint_positions[arm] for number in own]) - at_times(at, times, values)
     deviations = np.stack([(frames[n].joint_std or {}).get(arm, np.full(values.shape[1], np.nan)) for n in own])
     indices = np.array([frames[number].index for number in own])
     after = np.clip(np.searchsorted(at, times - _SAME_CLOCK), 0, len(at) - 1)

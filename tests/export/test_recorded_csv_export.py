@@ -108,6 +108,15 @@ def test_a_log_with_times_gets_interpolated_corrections_between_consecutive_fram
     np.testing.assert_array_equal(found[~marks], recorded[~marks])
 
 
+@pytest.mark.parametrize(("offset", "row", "frame"), [(-0.02, 0, 0), (0.12, 29, 5)])
+def test_a_frame_shortly_outside_of_the_log_corrects_its_first_or_last_row(tmp_path, offset, row, frame):
+    path = with_a_log(tmp_path / "set")
+    data = imported(path, tmp_path / "sequence", ImportOptions(frame_rate=RATE, time_offset=1e-9 * START + offset))
+    rows = rows_of(export(data, "recorded-csv", tmp_path / "out") / "_PSM1_measured_js.csv", 2)
+    found = [float(rows[row][f"position.{number}.corrected"]) for number in range(6)]
+    np.testing.assert_allclose(found, data.frames[frame].joint_positions["PSM1"][:6], rtol=0, atol=1e-9)
+
+
 def test_tip_poses_are_corrected_in_their_own_frame(tmp_path):
     path = tmp_path / "set"
     write_images(path / "left", FRAMES)
