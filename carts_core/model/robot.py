@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ..arrays import Array, array_if_faster, converted, library
 from ..errors import RobotError
-from ..files.reading import ROBOT, is_regular, read_text
+from ..files.reading import MESH, ROBOT, is_regular, read_text
 from ..reprs import short_repr
 from ..wording import listed, shown
 from . import mesh_cache
@@ -603,12 +603,23 @@ def _mesh_files(root: Element, urdf: Path) -> list[Path]:
     return [path for mesh in meshes if is_regular(path := mesh_path(urdf.parent, mesh.get("filename", "")))]
 
 
+_BESIDE = {".obj": ".mtl", ".gltf": ".bin"}
+"""Suffix of a mesh file -> suffix of the materials or buffers in its folder to which it can refer."""
+
+
 def _cache_key(files: list[Path], kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
     """Cache key of link meshes; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     # Units other than metres are part of the key, since older cache entries are not scaled.
     units = tuple(metres for file in files if (metres := collada_asset(file)[0]) != 1.0)
     settings = (kinematics.base_link, *limits, units) if units else (kinematics.base_link, *limits)
-    return mesh_cache.fingerprint([urdf, *files], *settings)
+    beside = {
+        path
+        for file in files
+        if (suffix := _BESIDE.get(file.suffix.lower()))
+        for path in file.parent.glob(f"*{suffix}")
+        if is_regular(path) and path.stat().st_size <= MESH.limit
+    }
+    return mesh_cache.fingerprint([urdf, *files, *sorted(beside)], *settings)
 
 
 def _remarks(files: Iterable[Path]) -> tuple[str, ...]:

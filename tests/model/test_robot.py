@@ -148,6 +148,17 @@ def test_meshes_come_from_the_cache_the_second_time(tmp_path: Path, monkeypatch:
         assert np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces)
 
 
+def test_a_changed_material_is_not_taken_from_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CARTS_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "arm.urdf").write_text(BRANCHED.replace('<sphere radius="0.01"/>', '<mesh filename="part.obj"/>'))
+    faces = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl paint\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "part.obj").write_text(f"mtllib paint.mtl\n{faces}")
+    for colour in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)):
+        (tmp_path / "paint.mtl").write_text("newmtl paint\nKd {} {} {}\n".format(*colour))
+        (mesh,) = Robot.load(tmp_path / "arm.urdf").meshes
+        assert np.allclose(mesh.color, colour)
+
+
 def test_a_damaged_cache_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
     Robot.load(shipped_robot())
