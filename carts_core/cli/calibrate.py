@@ -260,12 +260,17 @@ class Calibrate:
         from ..optimization import Backgrounds, CalibrationOptimizer
         from ..optimization.hand_eye import read_prior
         from ..recording import Sequence
-        from .printing import calibration_hint, print_hints
+        from .printing import blank_hint, calibration_hint, print_hints
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = Selection(camera=self.camera).camera_names(sequence.scene)
-        indices = frame_indices(self.frames, self.positions, sequence)
+        chosen = frame_indices(self.frames, self.positions, sequence)
+        if not (indices := sequence.with_image(chosen, cameras)):
+            raise SettingsError(
+                f"no chosen frame has an image of {', '.join(cameras)}. Choose other frames or cameras."
+            )
+        print_hints(console, blank_hint(", ".join(cameras), chosen, indices))
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
         prior = read_prior(sequence)

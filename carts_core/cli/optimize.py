@@ -82,7 +82,7 @@ class Evaluate:
         from ..files import write_text
         from ..optimization import Backgrounds
         from ..recording import Sequence
-        from .printing import base_frame_hint, kept_start_hint, print_hints, score_table, verdict_line
+        from .printing import base_frame_hint, blank_hint, kept_start_hint, print_hints, score_table, verdict_line
 
         console = Terminal(stderr=self.json == STANDARD_OUTPUT)
         if not console.is_terminal:
@@ -108,12 +108,14 @@ class Evaluate:
             together=self.together,
             given=observer.given,
         )
-        total = len(frames) * len(cameras) * len(domains)
+        groups = {group: sequence.with_image(frames, group) for group in camera_groups(cameras, self.together)}
+        print_hints(console, *(blank_hint(", ".join(group), frames, seen) for group, seen in groups.items()))
+        total = len(domains) * sum(len(group) * len(seen) for group, seen in groups.items())
         with message_if_stopped("nothing was written"):
             scores = list(track(found, "optimizing", total=total, console=console))
         console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
         print_hints(console, self.network.caution)
-        for group in camera_groups(cameras, self.together):
+        for group in groups:
             where, seen = ", ".join(group), [score for score in scores if score.camera == group[0]]
             print_hints(
                 console,
@@ -124,7 +126,7 @@ class Evaluate:
         if any(score.verdict not in (None, "good") for score in scores):
             print_hints(console, "--json FILE also writes the reasons for the verdicts.")
         required = self.solving.chosen.needs_background
-        for group in [] if observer.masked else camera_groups(cameras, self.together):
+        for group in [] if observer.masked else groups:
             for domain in domains:
                 print_hints(console, *Backgrounds.of(sequence, group, domain, required=required).problems)
         if self.json is not None:

@@ -41,6 +41,7 @@ from ..wording import counted
 from .options import RECORDING, Observer, OptimizeOptions, check_writable, output_folder
 from .printing import (
     base_frame_hint,
+    blank_hint,
     constant_correction_hint,
     kept_start_hint,
     print_hints,
@@ -371,7 +372,12 @@ class OptimizeRun:
         return _Part(setup, FrameFolder(sequence, cameras, folder, self._result_settings(), asked.overwrite))
 
     def _run(self, part: _Part) -> None:
-        frames, output, setup, together = self._frames, part.output, part.setup, part.setup.model is not None
+        output, setup, together = part.output, part.setup, part.setup.model is not None
+        seen = self._sequence.with_image(self._frames, setup.cameras)
+        print_hints(self._console, blank_hint(part.name, self._frames, seen, carried=together and bool(seen)))
+        if not seen:
+            return
+        frames = self._frames if together else seen
         origins = FrameInputs(setup, self._observer, json.dumps(self._result_settings()))
         common = origins.common
         if together:
@@ -383,7 +389,8 @@ class OptimizeRun:
         self._report_others(part, common)
         if todo and isinstance(self._solver, SurfaceSolver):
             known = setup.backgrounds.covers(self._sequence.scene.with_cameras(setup.cameras))
-            warned = self._observer.warnings(self._sequence, todo[0], setup.domain, setup.cameras, background=known)
+            first = next((index for index in todo if index in seen), seen[0])
+            warned = self._observer.warnings(self._sequence, first, setup.domain, setup.cameras, background=known)
             print_hints(self._console, *warned)
         if not together:
             self._solve_frames(todo, part, now)

@@ -24,6 +24,19 @@ def print_hints(console: Console, *hints: str | None) -> None:
             console.print(hint, style="yellow")
 
 
+def blank_hint(where: str, frames: Sequence[int], seen: Sequence[int], *, carried: bool = False) -> str | None:
+    """Hint on frames without an image; None if there are none.
+
+    Args:
+        frames, seen: all frames, and those with an image.
+        carried: whether frames without an image are predicted from the others.
+    """
+    if len(seen) == len(frames):
+        return None
+    fate = "are predicted from the other frames, without a verdict" if carried else "are left out"
+    return f"{where}: {len(frames) - len(seen)} of {counted(len(frames), 'frame')} have no image and {fate}."
+
+
 def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
     """Hint that estimates equal their initial values; None without such estimates."""
     kept = sum(reason == "start kept" for reason in stopped)

@@ -108,7 +108,7 @@ def evaluate(
     Args:
         sequence: sequence with or without ground truth of masks and kinematics.
         networks: networks, or a predictor of surface maps.
-        frames: indices in the sequence.
+        frames: indices in the sequence; frames without an image are left out.
         cameras: names of cameras, optimized separately unless `together`.
         domains: names of domains.
         settings, free: settings and free parameters of the optimization.
@@ -124,10 +124,12 @@ def evaluate(
 
     for domain, group in product(domains, camera_groups(cameras, together)):
         ignore = (lambda _: {}) if given is None else given.ignored
+        if not (seen := sequence.with_image(frames, group)):
+            continue
         setup = Setup(sequence, domain, group, networks, settings, free, model, perturb_deg, seed, ignore)
         scene = sequence.scene.with_cameras(group)
         renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
-        for frame, estimate in _estimates(setup, frames):
+        for frame, estimate in _estimates(setup, seen):
             share = replace(estimate, seconds=estimate.seconds / len(group))
             scored = frame if given is None else given.filled(frame)
             for camera, renderer in renderers.items():

@@ -156,7 +156,8 @@ class SequenceOptimizer:
     After the last frame all corrections are smoothed backwards, and frames whose images contradict the result are
     optimized again. Finally, all estimates are assessed. Without keyframes, failed frames are solved individually if
     only joints are free, and if the sequence failed, frames that still fail return to their measured values. The joint
-    positions of frames in `keyframes` are not changed.
+    positions of frames in `keyframes` are not changed. Frames without an image are predicted from the others and not
+    assessed.
 
     Args:
         load: returns the frame at an index of the sequence, whose `measured` values are corrected.
@@ -260,6 +261,20 @@ class SequenceOptimizer:
             self._estimates = {index: self._estimate(index, self._visits[index], known[index]) for index in known}
         return dict(self._estimates)
 
+    @property
+    def _seen(self) -> list[int]:
+        """Visited frames with an image, in visiting order."""
+        return [index for index, visit in self._visits.items() if not visit.blank]
+
+    @property
+    def _begun(self) -> bool:
+        """Whether a keyframe or a frame with an image has been visited."""
+        return any(not visit.blank or index in self._keyframes for index, visit in self._visits.items())
+
+    def _is_blank(self, frame: Frame) -> bool:
+        """Whether a frame has no image of any camera."""
+        return {camera.name for camera in self._scene.cameras} <= set(frame.missing)
+
     def cancel(self) -> None:
         """Stop the optimization; `estimates` are kept."""
         self.stop_reason = self.stop_reason or "cancelled"
@@ -301,7 +316,7 @@ class SequenceOptimizer:
         if self.assessment is None or self._free.base_frames:
             return None
         corrections = self._smoother.smoothed()
-        indices = sorted(corrections)
+        indices = sorted(self._seen)
         chosen = [indices[place] for place in evenly_spaced(len(indices), min(_LOOKED_AT, len(indices)))]
         return statistics.median(
             [self._solver.base_frame_gain(*self._open(i), corrections[i].mean, self._free) for i in chosen]
@@ -315,7 +330,7 @@ class SequenceOptimizer:
         individually = set(anchors)
         known: dict[int, Assessment] = {}
         # The other frames come last, since their verdicts depend on these frames.
-        for index in sorted(self._visits, key=lambda index: index not in individually):
+        for index in sorted(self._seen, key=lambda index: index not in individually):
             began, estimate = time.perf_counter(), self.estimates[index]
             found = None if index in individually else self._between_good_frames(index, anchors, known)
             if found is None:
@@ -346,7 +361,7 @@ class SequenceOptimizer:
     def _anchors(self) -> list[int]:
         """Frames that get their own verdict: those that needed the network, and a few routine ones."""
         chosen, since = [], self.model.assess_every
-        for index in sorted(self._visits):
+        for index in sorted(self._seen):
             visit, since = self._visits[index], since + 1
             if not (visit.measurement.by_colours or (visit.routine and since < self.model.assess_every)):
                 chosen.append(index)
@@ -364,17 +379,19 @@ class SequenceOptimizer:
         return max(beside, key=lambda one: one.probability)
 
     def _assess_whole(self) -> None:
-        """Assess the sequence; if it failed and there are no keyframes, failed frames return to their measured
-        values."""
+        """Assess the sequence; if it failed and there are no keyframes, failed frames and frames without an image
+        return to their measured values."""
         kept = self.estimates
-        found = {index: estimate.assessment for index, estimate in kept.items() if estimate.assessment is not None}
-        self.assessment = assess_sequence(list(found.values()))
+        found = [estimate.assessment for estimate in kept.values() if estimate.assessment is not None]
+        if not found:
+            return
+        self.assessment = assess_sequence(found)
         if self.assessment.verdict is Verdict.FAILED and not self._keyframes:
-            for index, assessment in found.items():
-                if assessment.verdict is Verdict.FAILED:
+            for index, estimate in kept.items():
+                if estimate.assessment is None or estimate.assessment.verdict is Verdict.FAILED:
                     visit = replace(self._visits[index], start=Origin.MEASURED)
                     measured = visit.estimate(self._scene, index, self._prior, self._prior)
-                    kept[index] = replace(measured, assessment=assessment, seconds=kept[index].seconds)
+                    kept[index] = replace(measured, assessment=estimate.assessment, seconds=estimate.seconds)
         self._estimates = kept
 
     def _solve_initial(self, index: int) -> FrameEstimate | None:
@@ -384,6 +401,8 @@ class SequenceOptimizer:
             frame, variables = self._open(index)
             if index in self._keyframes:
                 start, measurement = Origin.KEYFRAME, self._keyframe(frame, variables, self._prior)
+            elif self._is_blank(frame):
+                return None
             else:
                 start, measurement = Origin.COLD, self._solver.cold(frame, variables, self._prior, quick=True)
         except CartsError:
@@ -398,14 +417,17 @@ class SequenceOptimizer:
             corrections = {alone: visit.measurement.correction for alone, visit in self._initial.items()}
             self._initial_correction = initial_correction(corrections, self._solver, self._open, self.model.cold_factor)
         frame, variables = self._open(index)
-        expected, routine = self._smoother.expected(index), False
+        expected, routine, blank = self._smoother.expected(index), False, self._is_blank(frame)
         if index in self._keyframes:
             start, measurement = Origin.KEYFRAME, self._keyframe(frame, variables, expected)
-        elif self._visits and (found := self._tracker.measured(self._solver, frame, variables, expected)) is not None:
+        elif blank:
+            nothing = Information.nothing(len(variables))
+            start, measurement = Origin.CARRIED, Measurement(expected.mean, nothing, loss=0.0, iterations=0)
+        elif self._begun and (found := self._tracker.measured(self._solver, frame, variables, expected)) is not None:
             start, measurement = Origin.WARM, found
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
-            contradicts = bool(self._visits) and measurement.information.contradicts(expected)
+            contradicts = self._begun and measurement.information.contradicts(expected)
             usual = not (lost or contradicts) and measurement.loss <= self._unusual_loss()
             routine = usual and start is Origin.WARM and self._tracker.ready
             self._tracker.learn(self._solver, frame, variables, measurement, usual)
@@ -420,14 +442,14 @@ class SequenceOptimizer:
             seconds += sum(visit.seconds for visit in self._initial.values())
             before = sum(visit.measurement.iterations for visit in self._initial.values())
             measurement = replace(measurement, iterations=measurement.iterations + before)
-        visit = self._visits[index] = Visit(frame.frame_id, variables, measurement, start, seconds, routine)
+        visit = self._visits[index] = Visit(frame.frame_id, variables, measurement, start, seconds, routine, blank)
         self._estimates = None
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 
     def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
         """Measure a frame from a warm start, or from a cold start for the first frame or after an unusual loss; the
         last value is whether recovery failed."""
-        if not self._visits:
+        if not self._begun:
             if self._initial_correction is None:
                 return Origin.COLD, self._solver.cold(frame, variables, self._prior), False
             return Origin.COLD, self._solver.warm(frame, variables, self._prior, self._initial_correction), False
@@ -446,7 +468,8 @@ class SequenceOptimizer:
 
     def _unusual_loss(self) -> float:
         """Loss above which a frame gets a cold start."""
-        losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
+        visits = [self._visits[index] for index in self._seen]
+        losses = [visit.measurement.loss for visit in visits if visit.start is not Origin.CARRIED]
         return self.model.cold_factor * statistics.median(losses or [math.inf])
 
     def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
@@ -461,13 +484,13 @@ class SequenceOptimizer:
         return frame, Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:
-        """Frames with `Origin.CARRIED` or a measurement that contradicts the smoothed correction, except keyframes,
-        with the prediction from the other frames."""
-        chosen = []
-        for index, smoothed in self._smoother.smoothed().items():
+        """Frames with `Origin.CARRIED` or a measurement that contradicts the smoothed correction, with the prediction
+        from the other frames; neither keyframes nor frames without an image."""
+        chosen, corrections = [], self._smoother.smoothed()
+        for index in self._seen:
             if index in self._keyframes:
                 continue
-            visit = self._visits[index]
+            visit, smoothed = self._visits[index], corrections[index]
             certain = Gaussian(smoothed.mean, np.zeros_like(smoothed.covariance))
             if visit.start is Origin.CARRIED or visit.measurement.information.contradicts(certain):
                 chosen.append((index, remove_measurement(smoothed, visit.measurement.information)))

@@ -453,7 +453,7 @@ class Origin(StrEnum):
     KEYFRAME = "keyframe"
     """Joint positions set manually."""
     CARRIED = "carried"
-    """Predicted from the other frames; the image contradicts them and is ignored."""
+    """Predicted from the other frames; the image contradicts them and is ignored, or is missing."""
     MEASURED = "measured"
     """Measured values, restored because the sequence and this frame failed."""
 
@@ -479,7 +479,7 @@ class FrameEstimate:
     seconds: float
     """Time spent on the frame over all visits, including reading [s]."""
     assessment: Assessment | None = None
-    """Verdict; None before all frames are visited."""
+    """Verdict; None before all frames are visited, and for a frame without an image."""
 
     __repr__ = short_repr
 
@@ -530,6 +530,8 @@ class Visit:
     seconds: float
     routine: bool = False
     """Whether the network was evaluated only because it was due, with the usual result."""
+    blank: bool = False
+    """Whether the frame has no image of any camera."""
 
     def estimate(self, scene: Scene, index: int, correction: Gaussian, prior: Gaussian) -> FrameEstimate:
         """Estimate of the frame for a correction of the measured values [rad], given the prior before any image."""

@@ -240,6 +240,12 @@ class Sequence:
         missing = self._camera(camera).missing
         return [index for index in range(len(self)) if index not in missing]
 
+    def with_image(self, indices: Iterable[int], cameras: Iterable[str]) -> list[int]:
+        """Those of the given frames with an image of at least one of the cameras; `SequenceError` for an unknown
+        camera."""
+        entries = [self._camera(name) for name in cameras]
+        return [index for index in indices if any(index not in entry.missing for entry in entries)]
+
     @property
     def moving_cameras(self) -> tuple[str, ...]:
         """Names of the moving cameras."""

@@ -216,6 +216,28 @@ def test_backward_ends_as_forward(truths: Truths, forward: tuple[SequenceOptimiz
 
 
 @pytest.mark.slow
+def test_frames_without_an_image_are_carried_and_not_assessed(truths: Truths) -> None:
+    blank = {0, 2, 3}
+
+    def load(index: int) -> Frame:
+        frame = truths.load(index)
+        black = {name: np.zeros_like(image) for name, image in frame.images.items()}
+        return replace(frame, images=black, missing=("left",)) if index in blank else frame
+
+    times = {index: float(index) / 10 for index in range(FRAMES)}
+    for model in (ALONE, SequenceSettings(between=())):
+        sequence = SequenceOptimizer(truths.sequence.scene, load, times, truths, model=model)
+        list(sequence)
+        assert sequence.assessment is not None and sequence.assessment.verdict is Verdict.GOOD
+        assert sequence.assessment.counts["good"] == FRAMES - len(blank)
+        for index, estimate in sequence.estimates.items():
+            assert (estimate.start == "carried") == (estimate.assessment is None) == (index in blank)
+            assert error(truths, index, estimate.joint_positions)[:2].max() < np.deg2rad(0.3)
+    nothing = SequenceOptimizer(truths.sequence.scene, load, {2: None, 3: None}, truths)
+    list(nothing)
+    assert nothing.assessment is None and nothing.base_frame_gain() is None and len(nothing.estimates) == 2
+
+
 def test_a_jump_of_the_error_begins_anew(truths: Truths) -> None:
     """From frame 3 on the encoders are off by other amounts, as after homing."""
     jump = np.deg2rad([2.5, -2.5, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -1,11 +1,13 @@
 """Recordings in which a camera has no image of some frames."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from carts_core.cli import main
 from carts_core.errors import SequenceError, SettingsError
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, SurfaceSolver
@@ -63,6 +65,33 @@ def test_a_frame_is_solved_with_the_cameras_that_have_an_image(sparse: Path) -> 
         solved("right")
     with pytest.raises(SettingsError, match="has no image of right"):
         FrameOptimizer(sequence.scene, frame, backgrounds, extractor, settings=DescentSolver())
+
+
+def test_commands_leave_out_frames_without_an_image_or_predict_them(
+    sparse: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequence = marked(sparse)
+    assert sequence.with_image(range(3), ["right"]) == [0, 2]
+    assert sequence.with_image(range(3), ["left", "right"]) == [0, 1, 2]
+
+    def said(command: str, *options: str) -> str:
+        main([command, str(sparse), "--camera", "right", *options])
+        return " ".join(capsys.readouterr().out.split())
+
+    quick, out, scores = ["--settings", "iterations=2"], tmp_path / "out", tmp_path / "scores.json"
+    left_out = "right: 1 of 3 frames have no image and are left out."
+    assert left_out in said("optimize", "--output", str(out), *quick)
+    assert sorted(path.name for path in (out / "regular/right/masks").iterdir()) == ["001.png", "003.png"]
+    assert "2 of 2 frames already done" in said("optimize", "--output", str(out), *quick)
+    assert left_out in said("evaluate", "--json", str(scores), *quick)
+    assert [score["frame"] for score in json.loads(scores.read_text())["frames"]] == ["001", "003"]
+    assert left_out in said("calibrate", "--output", str(tmp_path / "calibration"), "--frames", "all", *quick)
+    predicted = "1 of 3 frames have no image and are predicted from the other frames"
+    assert predicted in said("optimize", "--mode", "sequence", "--output", str(tmp_path / "both"), *quick)
+    assert len(list((tmp_path / "both/regular/right/masks").iterdir())) == 3
+    with pytest.raises(SystemExit):
+        said("calibrate", "--output", str(tmp_path / "none"), "--frames", "002")
+    assert "no chosen frame has an image of right" in " ".join(capsys.readouterr().err.split())
 
 
 def test_frames_with_one_camera_are_imported(sparse: Path, tmp_path: Path) -> None:
