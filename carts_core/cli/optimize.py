@@ -93,7 +93,9 @@ class Evaluate:
         domains = self.select.domain_names(sequence)
         sequence = self.source.corrected(sequence, frames, console)
         observer = self.network.observer(self.solving.chosen, sequence)
-        observer.check(sequence, frames, cameras, domains)
+        groups = {group: sequence.with_image(frames, group) for group in camera_groups(cameras, self.together)}
+        for group, seen in groups.items():
+            observer.check(sequence, seen, group, domains)
         found = evaluate(
             sequence,
             observer.predictor,
@@ -108,7 +110,6 @@ class Evaluate:
             together=self.together,
             given=observer.given,
         )
-        groups = {group: sequence.with_image(frames, group) for group in camera_groups(cameras, self.together)}
         print_hints(console, *(blank_hint(", ".join(group), frames, seen) for group, seen in groups.items()))
         total = len(domains) * sum(len(group) * len(seen) for group, seen in groups.items())
         with message_if_stopped("nothing was written"):

@@ -344,7 +344,8 @@ class OptimizeRun:
         self._observer = asked.network.observer(self._solver, self._sequence)
         select = asked.select
         cameras, domains = select.camera_names(self._sequence.scene), select.domain_names(self._sequence)
-        self._observer.check(self._sequence, self._frames, cameras, domains)
+        for group in camera_groups(cameras, asked.together):
+            self._observer.check(self._sequence, self._sequence.with_image(self._frames, group), group, domains)
 
     def run(self) -> None:
         """Optimize the frames without an up-to-date result; most errors are raised before anything is written."""

@@ -89,6 +89,15 @@ def test_commands_leave_out_frames_without_an_image_or_predict_them(
     predicted = "1 of 3 frames have no image and are predicted from the other frames"
     assert predicted in said("optimize", "--mode", "sequence", "--output", str(tmp_path / "both"), *quick)
     assert len(list((tmp_path / "both/regular/right/masks").iterdir())) == 3
+    # Frames without an image need no mask.
+    (sparse.parent / "masks/right/002.png").unlink()
+    sparse.write_text(sparse.read_text().replace("sparse_images = true", "sparse_images = true\nsparse_masks = true"))
+    for mode in ("frame", "sequence"):
+        options = ["--observe", "masks", "--mode", mode, *quick]
+        assert left_out in said("evaluate", *options)
+        said("optimize", "--output", str(tmp_path / mode), *options)
+        frames = len(list((tmp_path / mode / "regular/right/masks").iterdir()))
+        assert frames == (2 if mode == "frame" else 3)
     with pytest.raises(SystemExit):
         said("calibrate", "--output", str(tmp_path / "none"), "--frames", "002")
     assert "no chosen frame has an image of right" in " ".join(capsys.readouterr().err.split())
