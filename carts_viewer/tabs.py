@@ -218,14 +218,16 @@ class Tab:
             self._scored = True
             if pictured:
                 self._pictured = self.controller.state
-        self.show_panels()
+        self.show_panels(attempt)
 
-    def show_panels(self) -> None:
-        """Update the widgets."""
-        if self._shown is not self.controller.state:
+    def show_panels(self, attempt: Callable[[Callable[[], None]], None]) -> None:
+        """Update the widgets; `attempt` as in `show_picture`."""
+        state, view = self.controller.state, self.view
+        if self._shown is not state:
+            if view is not None:
+                attempt(lambda: view.display.show_panels(state))
+            # Set also after an error, which would otherwise recur endlessly.
             self._shown = self.controller.state
-            if self.view is not None:
-                self.view.display.show_panels(self._shown)
 
     def close(self) -> None:
         """Save unfinished edits, and stop prefetching frames.

@@ -80,7 +80,7 @@ class Worker:
         """Show a text about the current preparation at once in all tabs; called on the worker's thread."""
         for tab in self._tabs:
             tab.controller.say(text)
-            tab.show_panels()
+            tab.show_panels(lambda work, tab=tab: self._attempt(work, tab))
 
     def _work(self) -> None:
         self._publish()
@@ -159,7 +159,7 @@ class Worker:
             self._tabs.job_runner.advance()
         except Exception as error:
             text = self._fail(error, *self._tabs)
-            self._tabs.job_runner.fail(text)
+            self._attempt(lambda: self._tabs.job_runner.fail(text), *self._tabs)
 
     def _set_resting(self, resting: bool) -> None:
         with self._rest:

@@ -334,5 +334,5 @@ class JobsHandler(Handler):
             networks=networks.names,
             network=networks.used,
             asked_network=networks.asked,
-            problems=tuple(filter(None, (self._list.problem, networks.problem))),
+            problems=tuple(filter(None, (self._list.problem, self._list.unsaved, networks.problem))),
         )

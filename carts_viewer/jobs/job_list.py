@@ -219,11 +219,12 @@ class _Row(Job):
 
 
 class JobList:
-    """All jobs, oldest first; every change of a state is saved before work continues.
+    """All jobs, oldest first; every change of a state is saved before work continues, if the file can be written.
 
     Attributes:
         jobs: the list.
         problem: message about a damaged file; empty if the file was not damaged.
+        unsaved: message about the last write, if it failed; otherwise empty.
     """
 
     def __init__(
@@ -232,7 +233,7 @@ class JobList:
         """`recording`: digest of the recording; jobs in a list of another recording do not count as this user's."""
         self._path = output_path(project.parent, f"{project.stem}_jobs.json") if kept else None
         self._frame_ids, self._recording, self._decisions = frame_ids, recording, decisions
-        self.problem = ""
+        self.problem = self.unsaved = ""
         self.jobs: tuple[Job, ...] = tuple(map(self._resumed, self._read()))
 
     def add(self, kind: str, values: Mapping[str, Any]) -> Job:
@@ -250,7 +251,11 @@ class JobList:
         ended = [job for job in self.jobs if job.over]
         self._drop(ended[: max(len(ended) - _MAX_ENDED, 0)])
         self.jobs = (*self.jobs, job)
-        self._write()
+        try:
+            self._write()
+        except CartsError:
+            self._drop([job])
+            raise
         return job
 
     def change(self, number: int, line: str | None = None, **changes: Any) -> None:
@@ -258,27 +263,31 @@ class JobList:
         before = self.jobs
         self.jobs = tuple(_changed(job, line, changes) if job.number == number else job for job in self.jobs)
         if [job.state for job in before] != [job.state for job in self.jobs]:
-            self._write()
+            self.save()
 
     def accept(self, number: int, options: Options) -> None:
         """Queue a job of another user, with these options, as a job of this user."""
         job = replace(self.find(number), state=JobState.WAITING, options=options)
         job = self._own(job)
         self.jobs = tuple(job if each.number == number else each for each in self.jobs)
-        self._write()
+        self.save()
 
     def is_own(self, job: Job) -> bool:
         """Whether this user has queued or accepted a job on this machine."""
         return bool(job.token) and self._decisions.find(self._identity(job)) is True
 
     def save(self) -> None:
-        """Write the list."""
-        self._write()
+        """Write the list; a failure is kept in `unsaved`, since jobs continue without the file."""
+        self.unsaved = ""
+        try:
+            self._write()
+        except CartsError as error:
+            self.unsaved = f"Jobs would be lost if the viewer was closed now: {error}"
 
     def forget(self) -> None:
         """Remove ended jobs from the list."""
         self._drop([job for job in self.jobs if job.over])
-        self._write()
+        self.save()
 
     def find(self, number: int) -> Job:
         """A job by its number.

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from viewer_desk import Desk
-from viewer_tab import OpenViewer, widget
+from viewer_tab import OpenViewer, place_of, view_of, widget
 from waiting import eventually
 
 from carts_core.errors import CartsError
@@ -124,6 +124,48 @@ def test_after_the_viewer_was_killed_waiting_jobs_wait_and_the_one_that_ran_is_s
     assert [job.state for job in again.jobs] == [JobState.FAILED, JobState.WAITING]
     assert "start the job again" in again.jobs[0].text and again.jobs[1] == second
     assert again.jobs[0].options == OptimizeOptions((0, 1)) and again.jobs[0].done == 1
+
+
+def test_the_viewer_goes_on_when_the_list_of_jobs_cannot_be_written(open_viewer: OpenViewer) -> None:
+    app = open_viewer(frames=2)
+    file = app.project.path.with_name(f"{app.project.path.stem}_jobs.json")
+    app.queue.put(intents.Export("csv", "All"))
+    assert app.wait_until_shown().jobs[0].state is JobState.DONE
+    file.unlink()
+    (file / "blocked").mkdir(parents=True)
+    # A job that cannot be written is not queued; those in the list continue and end.
+    app.queue.put(intents.Export("csv", "All"))
+    state = app.wait_until_shown()
+    assert len(state.jobs) == 1 and file.name in str(state.error)
+    app.queue.put(intents.RemoveEndedJobs())
+    state = app.wait_until_shown()
+    assert state.jobs == () and any(file.name in problem for problem in state.problems)
+    shutil.rmtree(file)
+    app.queue.put(intents.Export("csv", "All"))
+    state = app.wait_until_shown()
+    assert state.jobs[0].state is JobState.DONE and not state.problems
+
+
+def test_a_job_whose_list_cannot_be_written_ends_as_any_other(desk: Desk) -> None:
+    desk.do(intents.SetSetting("solver", "surface"), intents.OptimizeFrames("all"))
+    project = desk.session.editor.project.path
+    file = project.with_name(f"{project.stem}_jobs.json")
+    file.unlink()
+    (file / "blocked").mkdir(parents=True)
+    state = desk.finish()
+    assert states(desk) == [("optimize", "done")] and any(file.name in problem for problem in state.problems)
+
+
+def test_the_worker_survives_an_error_of_the_panels(open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = open_viewer(frames=2)
+    with RawTab(app.url) as raw:
+        panel = type(view_of(app, raw).layout.panels[0])
+        with monkeypatch.context() as broken:
+            broken.setattr(panel, "show", lambda *_: 1 / 0)
+            place_of(app, raw).put(intents.MoveFrame(1))
+            assert "ZeroDivisionError" in str(app.wait_until_shown().error)
+        place_of(app, raw).put(intents.DismissError())
+        assert app.wait_until_shown().error is None
 
 
 def test_options_of_a_job_are_clamped_as_in_the_page() -> None:
