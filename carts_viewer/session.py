@@ -29,9 +29,12 @@ from carts_core.project import (
 )
 from carts_core.project.state import calibrated_scene, corrected_state, source_of
 from carts_core.recording import Frame, FrameReader, Sequence
+from carts_core.settings import FreeParameters
 from carts_viewer.editing import Editor, People, Person
 from carts_viewer.start.roots import Roots
 from carts_viewer.state import NETWORK, Observed, Pose, Target, joint_range
+
+_JOINTS_ALONE = FreeParameters()
 
 
 class Session:
@@ -151,6 +154,7 @@ class Session:
         state: SceneState,
         provenance: Provenance,
         joint_std: Mapping[str, Float[np.ndarray, " dofs"]] | None = None,
+        free: FreeParameters = _JOINTS_ALONE,
     ) -> dict[Key[Any], Any]:
         """Edits that set the frame's pose.
 
@@ -161,6 +165,8 @@ class Session:
             state: its new pose.
             provenance: provenance of the changed values.
             joint_std: arm -> standard deviations [rad, m], NaN if unknown.
+            free: free parameters; groups of the calibration that are not free are not edited, since `state` may contain
+                an earlier calibration.
         """
         saved = self.editor.project.state
         before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured, None, frame.mounts)
@@ -173,13 +179,13 @@ class Session:
                 edits[key] = None
             else:
                 edits[key] = joint_correction(values, provenance, (joint_std or {}).get(arm.name))
-            if not np.array_equal(state.T_world_base[row], before.T_world_base[row]):
+            if free.base_frames and not np.array_equal(state.T_world_base[row], before.T_world_base[row]):
                 edits[Key.base_frame(arm.name)] = _transform(state.T_world_base[row], provenance)
         for row, camera in enumerate(self.scene.cameras):
             transform, intrinsics = state.T_camera_world[row], state.intrinsics[row]
-            if not np.array_equal(transform, before.T_camera_world[row]):
+            if free.extrinsics and not np.array_equal(transform, before.T_camera_world[row]):
                 edits[Key.extrinsics(camera.name)] = _transform(transform, provenance)
-            if not np.array_equal(intrinsics, before.intrinsics[row]):
+            if free.intrinsics and not np.array_equal(intrinsics, before.intrinsics[row]):
                 edits[Key.intrinsics(camera.name)] = CorrectedIntrinsics(tuple(intrinsics.tolist()), provenance)
         return edits
 

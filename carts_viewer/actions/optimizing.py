@@ -374,7 +374,8 @@ class OptimizingHandler(Handler):
         """Set the frame's pose to an iterate; all iterates of a run are one undo step."""
         state = self._context.state
         assert run.provenance is not None
-        edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
+        pose, free = run.pose(iterate).scene, run.task.free
+        edits = self._session.edits(state.frame, pose, run.provenance, iterate.joint_std(), free)
         # An earlier verdict refers to another pose.
         edits[Key.verdict(state.index)] = verdict
         maps = Maps(iterate, run.cameras)

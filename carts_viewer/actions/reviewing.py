@@ -180,10 +180,10 @@ class AnnotatingHandler(Handler):
         self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
 
     def _moved_since(self, scene: SceneState) -> bool:
-        """Whether the arms were moved, for example by a run, since they were fitted to pins."""
+        """Whether arms or cameras were moved, for example by a run or a calibration, since arms were fitted to pins."""
         if self._fitted is None:
             return True
-        pairs = zip(self._fitted.joint_positions, scene.joint_positions, strict=True)
+        pairs = zip(_moving(self._fitted), _moving(scene), strict=True)
         return not all(np.allclose(one, other, atol=1e-5) for one, other in pairs)
 
     def _nearest(self, pixel: tuple[float, float], camera: str) -> str:
@@ -192,6 +192,11 @@ class AnnotatingHandler(Handler):
         shown = project_keypoints(self._session.scene, state.pose.scene, points, camera)
         distances = np.nan_to_num(np.linalg.norm(shown - pixel, axis=-1), nan=math.inf)
         return list(self._keypoints)[int(distances.argmin())]
+
+
+def _moving(scene: SceneState) -> tuple[np.ndarray, ...]:
+    """Joint positions and calibration of a pose."""
+    return (*scene.joint_positions, scene.T_world_base, scene.T_camera_world, scene.intrinsics)
 
 
 _MAX_TEXT = 200

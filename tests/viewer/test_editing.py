@@ -12,8 +12,9 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import Keypoint, project_keypoints
 from carts_core.model.scene import Scene
-from carts_core.project import Figures, Key, Kind, Project, Provenance, Review, ReviewState, Source
+from carts_core.project import CorrectedTransform, Figures, Key, Kind, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence
+from carts_core.settings import FreeParameters
 from carts_viewer.actions import intents
 from carts_viewer.editing import People
 from carts_viewer.picture.overlay import keypoints_in_image, labelled_keypoints
@@ -247,6 +248,34 @@ def test_where_no_arm_is_that_is_said_once_and_nothing_moves(desk: Desk) -> None
     assert desk.saved.position == 0 and not desk.state.unsaved
 
 
+def _calibrate(desk: Desk, by: float = 0.01) -> CorrectedTransform:
+    """Move a base frame by `by` [m], as another tab or a job does."""
+    transform = np.array(desk.session.measured(desk.state.frame).T_world_base[0], np.float64)
+    transform[0, 3] += by
+    value = CorrectedTransform(tuple(map(tuple, transform.tolist())), HAND)
+    desk.session.editor.project.apply("Calibrate", {Key.base_frame("PSM1"): value})
+    desk.controller.follow()
+    return value
+
+
+def test_a_calibration_during_a_run_or_between_pins_stays(desk: Desk) -> None:
+    desk.do(intents.Run())
+    desk.advance()
+    moved = _calibrate(desk)
+    desk.finish()
+    assert desk.saved.steps[-1].name == "Optimize, frame 001"
+    assert desk.saved.get(Key.base_frame("PSM1")) == moved
+    desk.do(intents.ChooseKeypoint("wrist pitch joint"), intents.PointAt(40.0, 30.0), intents.Released())
+    moved = _calibrate(desk)
+    desk.do(intents.ChooseKeypoint("jaw 1 tip"), intents.PointAt(45.0, 36.0), intents.Released())
+    assert desk.saved.get(Key.base_frame("PSM1")) == moved
+    # The pins are fitted with the new calibration.
+    pins, shown = desk.state.keypoints.pins, desk.state.pose.scene
+    at = [project_keypoints(desk.session.scene, shown, [pin.keypoint], pin.camera)[0] for pin in pins]
+    distances = [math.dist(place.tolist(), pin.pixel) for place, pin in zip(at, pins, strict=True)]
+    assert len(pins) == 2 and max(distances) < 1.0
+
+
 # ---- Poses of frames ------------------------------------------------------------------------------------------------
 
 
@@ -298,7 +327,10 @@ def test_a_corrected_calibration_holds_in_every_frame(session: Session) -> None:
     intrinsics[0, 0] += 5.0
     bases[0, 1, 3] += 0.02
     moved = replace(state, T_camera_world=extrinsics, intrinsics=intrinsics, T_world_base=bases)
-    edits = session.edits(frame, moved, HAND)
+    # An edit by hand never changes the calibration.
+    assert {key.kind for key in session.edits(frame, moved, HAND)} == {Kind.JOINTS}
+    free = FreeParameters(base_frames=True, extrinsics=True, intrinsics=True)
+    edits = session.edits(frame, moved, HAND, free=free)
     assert {key.name for key in edits if key.kind in (Kind.EXTRINSICS, Kind.INTRINSICS)} == {"right", "left"}
     session.editor.project.apply("Calibrate", edits)
     other = _pose(session, 0).scene

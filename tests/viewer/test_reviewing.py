@@ -7,8 +7,8 @@ import pytest
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError
-from carts_core.optimization import BASE_FRAME_GAIN, undetermined_joints
-from carts_core.project import Figures, FitVerdict, Key, Review, ReviewState, Source
+from carts_core.optimization import BASE_FRAME_GAIN, FreeParameters, undetermined_joints
+from carts_core.project import Figures, FitVerdict, Key, Provenance, Review, ReviewState, Source
 from carts_viewer.actions import intents
 from carts_viewer.actions.frame_filter import (
     BY_HAND,
@@ -74,7 +74,9 @@ def test_the_calibration_is_part_of_what_was_accepted_in_every_frame(desk: Desk)
     scene = desk.state.pose.scene
     moved = scene.T_world_base.copy()
     moved[0, 0, 3] += 0.001
-    desk.controller._context.set_pose("Move the base", replace(scene, T_world_base=moved))
+    pose, free = replace(scene, T_world_base=moved), FreeParameters(base_frames=True)
+    edits = desk.session.edits(desk.state.frame, pose, Provenance(Source.HAND), free=free)
+    desk.controller._context.edit("Move the base", edits)
     assert [desk.saved.review(i).state for i in range(3)] == ["untouched", "rejected", "untouched"]
     desk.do(intents.Undo())
     assert [desk.saved.review(i).state for i in range(3)] == ["accepted", "rejected", "untouched"]
