@@ -8,6 +8,7 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.model.scene import SceneState
 from carts_core.optimization import Iterate
 from carts_core.project import Edits, FitVerdict, Key
+from carts_core.project.values import WHOLE_PROJECT
 from carts_core.recording import Frame
 from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
@@ -61,6 +62,8 @@ class OptimizingHandler(Handler):
         self._check: _Check | None = None
         self._before: Edits | None = None
         """Edits that restore the frame to the start of the last run."""
+        self._made: Edits = {}
+        """Newest edits of the last run."""
 
     @property
     def active(self) -> bool:
@@ -217,7 +220,14 @@ class OptimizingHandler(Handler):
         self.end(None)
         self._context.change(run=RunState())
         if self._before is not None:
-            self._context.edit("Reset to the start of the run", self._before)
+            # Calibration that the run did not change, or that was changed since, remains.
+            made, view = self._made, self._session.editor.view
+            edits = {
+                key: value
+                for key, value in self._before.items()
+                if key.frame != WHOLE_PROJECT or (key in made and made[key] == view.get(key))
+            }
+            self._context.edit("Reset to the start of the run", edits)
 
     def _on_SetSetting(self, intent: intents.SetSetting) -> None:
         state = self._context.state
@@ -287,7 +297,7 @@ class OptimizingHandler(Handler):
         if self._context.state.solving:
             raise CartsError("Many frames are being solved. Wait, or stop solving first.")
         self._context.save()
-        self._before = self._session.saved(self._context.state.index)
+        self._before, self._made = self._session.saved(self._context.state.index), {}
         self._run = self._optimizers.run(replace(self._task(self._context.cameras), shown=True))
         return self._run
 
@@ -378,6 +388,7 @@ class OptimizingHandler(Handler):
         edits = self._session.edits(state.frame, pose, run.provenance, iterate.joint_std(), free)
         # An earlier verdict refers to another pose.
         edits[Key.verdict(state.index)] = verdict
+        self._made = {**self._made, **edits}
         maps = Maps(iterate, run.cameras)
         self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
 

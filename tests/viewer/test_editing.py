@@ -276,6 +276,22 @@ def test_a_calibration_during_a_run_or_between_pins_stays(desk: Desk) -> None:
     assert len(pins) == 2 and max(distances) < 1.0
 
 
+def test_a_reset_takes_back_only_the_calibration_of_its_run(desk: Desk) -> None:
+    base, other = Key.base_frame("PSM1"), Key.extrinsics("right")
+    desk.do(intents.Run())
+    desk.finish()
+    moved = _calibrate(desk)
+    desk.do(intents.Reset())
+    assert desk.saved.get(base) == moved and not desk.saved.joints(0)
+    # The run changes both; the base frame is changed again.
+    desk.do(*(intents.SetFreeGroup(group, True) for group in ("base_frames", "extrinsics")), intents.Run())
+    desk.finish()
+    assert desk.saved.get(base) != moved and desk.saved.get(other) is not None
+    moved = _calibrate(desk)
+    desk.do(intents.Reset())
+    assert desk.saved.get(base) == moved and desk.saved.get(other) is None
+
+
 # ---- Poses of frames ------------------------------------------------------------------------------------------------
 
 
