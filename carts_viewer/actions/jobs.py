@@ -215,6 +215,8 @@ class JobsHandler(Handler):
         if requester is not None:
             requester.choose(self._context)
         try:
+            # The project, such as its calibration, may have changed since the job was queued.
+            self._context.refresh()
             match job.options:
                 case SolveOptions() as options:
                     self._propagating.solve(options.whole, options.at, job.frames)

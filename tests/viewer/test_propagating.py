@@ -204,6 +204,22 @@ def test_a_run_waits_for_solving_and_a_new_calibration_ends_it(desk: Desk) -> No
     assert not desk.state.solving and sources(desk) == [None] * FRAMES
 
 
+def test_frames_are_solved_with_the_calibration_at_the_start_of_their_job(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks, sequence = [], desk.factory.sequence
+    monkeypatch.setattr(desk.factory, "sequence", lambda task: (tasks.append(task), sequence(task))[1])
+    desk.do(intents.Export("csv", "All"), intents.SetRange((0, 1)), intents.Solve(whole=True))
+    assert [job.state for job in desk.state.jobs] == ["running", "waiting"]
+    intrinsics = tuple(value + 1 for value in desk.session.scene.cameras[0].intrinsics)
+    moved = CorrectedIntrinsics(intrinsics, Provenance(Source.HAND))
+    desk.session.editor.project.apply("Calibrate", {Key.intrinsics("left"): moved})
+    while not tasks:
+        desk.advance()
+    assert tuple(tasks[0].state.intrinsics[0]) == intrinsics
+    desk.do(intents.CancelJob(2))
+
+
 def test_dice_of_a_solved_frame_is_that_of_its_corrected_mask(desk: Desk) -> None:
     project = desk.session.editor.project
     everything, nothing = np.ones((96, 128), bool), np.zeros((96, 128), bool)
