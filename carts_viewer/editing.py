@@ -1,7 +1,8 @@
 """Edits by several users: drafts, undo steps, and the owners of steps.
 
-A single tab moves freely in the history. With several tabs, undo adds a step that reverts the last step that is the
-user's own or has no owner, such as a step from before the viewer started; steps of other users stay in effect.
+A single open tab moves freely in the history, over steps of closed tabs too. With several open tabs, undo adds a step
+that reverts the last step that is the user's own or has no owner, such as a step from before the viewer started; steps
+of other users stay in effect.
 """
 
 import time
@@ -84,7 +85,7 @@ class People:
 
     def can_undo(self, person: Person) -> bool:
         """Whether this user may have a step to undo."""
-        return self.project.state.position > 0 and (not self.several or self._last(person, free=True) is not None)
+        return self.project.state.position > 0 and (not self.several or self._last(person) is not None)
 
     def can_redo(self, person: Person) -> bool:
         """Whether this user has a step to redo."""
@@ -99,7 +100,7 @@ class People:
             CartsError: a later step has changed the same values.
             ProjectError: the change could not be saved.
         """
-        position, own = self.project.state.position, self._last(person, free=True)
+        position, own = self.project.state.position, self._last(person)
         if not self.several and own in (None, position):
             return self.project.go_to(max(position - 1, 0))
         if own is None:
@@ -146,11 +147,11 @@ class People:
         person.undone.clear()
         return project.go_to(position)
 
-    def _last(self, person: Person, *, free: bool) -> int | None:
-        """Last step in effect of this user or, if `free`, without an owner."""
-        owners = (person, None) if free else (person,)
+    def _last(self, person: Person) -> int | None:
+        """Last step in effect of this user or without an owner; for a user alone also of users who are absent."""
+        others = [one for one in self.persons if one is not person and (one.present or self.several)]
         done = range(self.project.state.position, 0, -1)
-        return next((n for n in done if n not in self._reverted and self._maker(n) in owners), None)
+        return next((n for n in done if n not in self._reverted and self._maker(n) not in others), None)
 
     def _maker(self, number: int) -> Person | None:
         """Owner of a step; for steps from before the viewer started, the user whose name precedes that of the step."""

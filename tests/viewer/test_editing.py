@@ -405,6 +405,17 @@ def test_a_user_alone_undoes_the_newest_step_even_if_its_maker_has_left(people: 
     assert _reviews(people)[0] == "untouched"
 
 
+def test_a_user_alone_undoes_the_newest_step_of_a_closed_page(people: People) -> None:
+    people.project.apply("Accept", {Key.review(0): ACCEPTED})
+    gone, new = people.join(), people.join()
+    people.apply(gone, "Reject", {Key.review(1): REJECTED})
+    gone.present = False
+    people.undo(new)
+    assert _reviews(people)[:2] == ["accepted", "untouched"]
+    people.undo(new)
+    assert _reviews(people)[0] == "untouched"
+
+
 def test_beside_others_ones_last_step_from_before_the_viewer_started_is_taken_back_and_theirs_are_not(
     people: People,
 ) -> None:
