@@ -171,6 +171,14 @@ class ProjectState:
         found = {arm: self.get(Key.joints(frame, arm)) for arm in self.identity.arms}
         return {arm: correction for arm, correction in found.items() if correction is not None}
 
+    def same_calibration(self, other: "ProjectState") -> bool:
+        """Whether the values of the whole project, such as base frames, are unchanged between two states."""
+        return self.records.get(WHOLE_PROJECT) is other.records.get(WHOLE_PROJECT)
+
+    def same_pose(self, other: "ProjectState", frame: int) -> bool:
+        """Whether the joint positions of a frame and the calibration are unchanged between two states."""
+        return self.joints(frame) == other.joints(frame) and self.same_calibration(other)
+
     def review(self, frame: int) -> Review:
         """Review state and note of a frame; see `Record.review`."""
         return self._record(frame).review

@@ -190,8 +190,7 @@ class PropagatingHandler(Handler):
         return not kept and now.joints(index) == self._before.joints(index)
 
     def _check_calibration(self) -> None:
-        now = self._session.editor.view
-        if now.records.get(WHOLE_PROJECT) is not self._before.records.get(WHOLE_PROJECT):
+        if not self._session.editor.view.same_calibration(self._before):
             self.drop("Stopped: the calibration was changed")
             raise CartsError(
                 "The calibration was changed in the meantime, so the solved frames are outdated. Solve them again."

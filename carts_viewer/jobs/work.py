@@ -24,7 +24,6 @@ from carts_core.project import (
     Provenance,
     ReviewState,
 )
-from carts_core.project.values import WHOLE_PROJECT
 from carts_core.recording import evenly_spaced
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_core.stopping import PARENT
@@ -72,10 +71,15 @@ def optimize_frames(
         if not target.seen(session.sequence, index, context.state.domain, cameras):
             yield Progress(place + 1, len(frames), f"Frame {name} has no mask", f"{name}: no mask to fit, not changed")
             continue
+        before = session.editor.view
         fit, edits, remark = yield from comparison.own_run(index, context.state)
         if remark is not None:
             worse += 1
             yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: discarded, worse than before ({remark})")
+            continue
+        now = session.editor.view
+        if index in now.kept_frames or not now.same_pose(before, index):
+            yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: discarded, edited during its run")
             continue
         context.save()
         changes = {**edits, Key.verdict(index): fit.verdict}
@@ -125,7 +129,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     if not edits:
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return
-    if session.editor.view.records.get(WHOLE_PROJECT) is not before.records.get(WHOLE_PROJECT):
+    if not session.editor.view.same_calibration(before):
         raise CartsError("The calibration was changed in the meantime, so this result is outdated. Calibrate again.")
     context.save()
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))

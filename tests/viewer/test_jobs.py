@@ -86,6 +86,16 @@ def test_what_was_chosen_for_a_job_is_forgotten_with_the_job(desk: Desk) -> None
     assert frame() is None
 
 
+@pytest.mark.parametrize("edit", [intents.SetJoint("PSM1", 0, 0.1), intents.SetReview(ReviewState.ACCEPTED)])
+def test_a_frame_that_is_edited_while_it_is_optimized_stays_as_edited(desk: Desk, edit: intents.Intent) -> None:
+    desk.do(intents.SetSetting("solver", "surface"), intents.OptimizeFrames("all"))
+    desk.advance()
+    before = desk.do(edit, intents.Released()).project
+    desk.finish()
+    assert desk.saved.joints(0) == before.joints(0) and desk.saved.review(0) == before.review(0)
+    assert any("001: discarded, edited during its run" in line for line in desk.state.jobs[0].log)
+
+
 def test_a_calibration_is_a_job_and_one_step_of_undo_and_says_what_it_does_to_accepted_frames(desk: Desk) -> None:
     desk.do(intents.SetReview(ReviewState.ACCEPTED), intents.Calibrate(2))
     desk.finish()
