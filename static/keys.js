@@ -38,6 +38,8 @@
     return name;
   }
 
+  // Actions that a held key repeats; all others need a look at their result, such as accepting a frame.
+  const REPEATED = /^(MoveFrame|ShowWorst|ShowUnreviewed|Nudge|ScaleBrush|Undo|Redo)\b/;
   let held = null; // the action whose key is down, and the key
 
   function press(event) {
@@ -49,9 +51,9 @@
     if (!name) return;
     event.preventDefault();
     event.stopPropagation();
+    if (event.repeat && !REPEATED.test(name)) return;
     if (name === "SetTool Select" && closeSomething()) return;
     if (local[name]) {
-      if (event.repeat) return;
       held = [name, event.code];
       local[name].down();
     } else window.carts.report("Pressed", { key: name });

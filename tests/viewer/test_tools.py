@@ -155,6 +155,17 @@ def test_keys_are_changed_refused_listed_and_remembered(open_tab: OpenTab) -> No
     eventually(lambda: tab.state.index, lambda index: index == 2)
 
 
+def test_a_held_key_repeats_motion_but_nothing_that_needs_a_look(open_tab: OpenTab) -> None:
+    tab = open_tab(frames=6, masks=False, width=160, height=120)
+    for key in "gn":
+        for _ in range(3):  # All but the first are repeats.
+            tab.page.keyboard.down(key)
+        tab.page.keyboard.up(key)
+    # One frame is accepted, which shows the next one; three more follow.
+    eventually(lambda: tab.state.index, lambda index: index == 4)
+    assert [tab.app.project.state.review(frame).state for frame in range(2)] == ["accepted", "untouched"]
+
+
 def test_escape_closes_what_was_opened_last(open_tab: OpenTab) -> None:
     tab = open_tab(width=160, height=120)
     page = tab.page
