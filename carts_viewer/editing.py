@@ -80,8 +80,12 @@ class People:
         return self._apply(person, name, edits, figures)
 
     def claim(self, person: Person) -> None:
-        """Assign the newest step, saved without an owner, to this user."""
-        self._makers[self.project.state.position] = person
+        """Assign the newest step to this user; undone steps that it replaced are forgotten."""
+        number = self.project.state.position
+        self._makers = {known: maker for known, maker in self._makers.items() if known < number} | {number: person}
+        self._reverted = {known for known in self._reverted if known < number}
+        for one in self.persons:
+            one.undone = [known for known in one.undone if known < number]
 
     def can_undo(self, person: Person) -> bool:
         """Whether this user may have a step to undo."""
@@ -181,13 +185,8 @@ class People:
     def _apply(self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None) -> Change | None:
         named = f"{person.name}: {name}" if person.chosen or self.several else name
         change = self.project.apply(named, edits, figures)
-        if change is not None and change.step is not None:
-            number = change.step.number
-            if max(self._makers, default=0) >= number:
-                # The undone steps no longer exist.
-                self._makers = {known: maker for known, maker in self._makers.items() if known < number}
-                self._reverted = {known for known in self._reverted if known < number}
-            self._makers[number] = person
+        if change is not None:
+            self.claim(person)
         return change
 
 

@@ -374,6 +374,7 @@ class ImportingHandler(Handler):
         self._context.end_run("Stopped: masks were imported")
         self._context.save()
         report = import_annotations(session.editor.project, found, source=path.name, replace=intent.replace)
-        session.editor.claim()
+        if report.changed:
+            session.editor.claim()
         self._context.refresh()
         self._context.change(layer=Layer.IMPORTED, imported=report.sentence(), error=None)

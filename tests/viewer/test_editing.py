@@ -416,6 +416,19 @@ def test_a_user_alone_undoes_the_newest_step_of_a_closed_page(people: People) ->
     assert _reviews(people)[0] == "untouched"
 
 
+def test_nobody_redoes_a_step_that_was_replaced_by_one_of_somebody_else(people: People) -> None:
+    ann, bob = people.join(), people.join()
+    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
+    people.apply(bob, "Reject", {Key.review(1): REJECTED})
+    people.undo(ann)
+    ann.present = False
+    people.go_to(bob, 2)
+    people.apply(bob, "Reject", {Key.review(2): REJECTED})
+    ann.present = True
+    assert not people.can_redo(ann) and people.redo(ann) is None
+    assert _reviews(people) == ["accepted", "rejected", "rejected", "untouched"]
+
+
 def test_beside_others_ones_last_step_from_before_the_viewer_started_is_taken_back_and_theirs_are_not(
     people: People,
 ) -> None:

@@ -28,6 +28,7 @@ from carts_core.project import (
     Key,
     MaskCorrection,
     Provenance,
+    Review,
     ReviewState,
     Source,
     import_annotations,
@@ -251,6 +252,17 @@ def test_an_import_is_one_step_shown_at_once_and_compared_with_where_the_recordi
     plain.do(intents.Undo())
     plain.controller.score()
     assert plain.state.scores.dice is None
+
+
+def test_an_import_without_a_change_takes_over_no_step_of_somebody_else(plain: Desk) -> None:
+    bring_in(plain)
+    people = plain.session.editor.people
+    people.apply(people.join(), "Accept", {Key.review(1): Review(ReviewState.ACCEPTED)})
+    bring_in(plain)
+    assert "nothing was changed" in plain.state.imported
+    plain.do(intents.Undo())
+    assert plain.saved.review(1).state is ReviewState.ACCEPTED
+    assert plain.saved.get(Key.imported_mask(0, "left")) is None
 
 
 def test_masks_of_the_recording_itself_stay_the_truth(desk: Desk) -> None:
