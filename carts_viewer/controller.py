@@ -62,6 +62,7 @@ class JobRunner:
         if self._jobs.takes(intent):
             self._jobs.ask(intent, JobRequester(person, state))
         else:
+            self._propagating.person = person
             (self._exporting if self._exporting.takes(intent) else self._propagating).handle(intent)
         self._jobs.settle()
 

@@ -29,6 +29,8 @@ class PropagatingHandler(Handler):
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         self._held: dict[int, Outcome] = {}
         """Frame -> result that fits worse than the previous pose and is not applied."""
+        self.person = context.session.editor.person
+        """User of the current intent; the user of the session's editor is that of the running job."""
         self._run: SequenceRun | None = None
         self._work: Iterator[Waiting] = iter(())
         self._reply: Waiting = None
@@ -239,7 +241,11 @@ class PropagatingHandler(Handler):
             edits.update(outcome.edits)
             del self._held[index]
         figures = {index: outcome.figures for index, outcome in taken.items()}
-        self._session.editor.apply(f"Take {counted(len(taken), 'solved pose')}", edits, figures)
+        if not now.same_calibration(self._before):
+            # Verdicts and figures refer to the earlier calibration.
+            edits, figures = {**edits, **{Key.verdict(index): None for index in taken}}, {}
+        people, name = self._session.editor.people, f"Take {counted(len(taken), 'solved pose')}"
+        people.apply(self.person, name, edits, figures)
         listed = self._context.state.solve.listed if self._context.state.solve else ()
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()

@@ -25,6 +25,7 @@ from carts_core.project import (
 )
 from carts_viewer.actions import intents
 from carts_viewer.actions.sequence import PropagatingHandler
+from carts_viewer.jobs import comparison
 from carts_viewer.panels.sequence import calibration_line
 
 FRAMES = 5
@@ -257,6 +258,27 @@ def test_a_suspicion_against_base_frames_is_said_when_frames_were_solved_until_t
     desk.session.editor.apply("Move the base", {Key.base_frame("PSM1"): corrected})
     desk.do(intents.ShowFrame(1))
     assert said() == "", "it was about another calibration"
+
+
+def test_a_solved_pose_is_taken_by_its_user_without_what_another_calibration_said_of_it(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparison, "worse_than", lambda fit, other: "loss")
+    desk.do(intents.SetRange((0, 1)), intents.Solve(whole=True))
+    desk.finish()
+    assert sources(desk) == [None] * FRAMES
+    desk.do(intents.TakeSolved(0))
+    assert desk.saved.verdict(0) is not None and desk.saved.figures(0) is not None
+    camera, editor = desk.session.scene.cameras[0], desk.session.editor
+    moved = CorrectedIntrinsics(tuple(value + 1 for value in camera.intrinsics), Provenance(Source.HAND))
+    other = editor.people.join()
+    editor.people.apply(other, "Calibrate", {Key.intrinsics("left"): moved})
+    desk.job_runner.handle(intents.TakeSolved(1), other, desk.state)
+    assert sources(desk)[:2] == [Source.PROPAGATED] * 2
+    assert desk.saved.verdict(1) is None and desk.saved.figures(1) is None
+    # The other user's step is not undone.
+    desk.do(intents.Undo())
+    assert sources(desk)[:2] == [None, Source.PROPAGATED]
 
 
 # ---- Random sets of keyframes ---------------------------------------------------------------------------------------
