@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carts_core.errors import CartsError, ProjectError
-from carts_core.project import Change, Edits, Figures, Project, ProjectState, Step
+from carts_core.project import Change, Edits, Figures, Kind, Project, ProjectState, Review, Step
 
 MAX_NAME_LENGTH = 30
 """Maximum length of a user's name [characters]."""
@@ -211,6 +211,8 @@ class Editor:
         self._gesture: object = None
         self._edits: Edits = {}
         self._changed_at = 0.0
+        self._base = self.project.state
+        """The saved state at the start of the draft."""
         self._view: tuple[ProjectState, ProjectState] | None = None
         """The saved state, and that state with the draft; None without a draft."""
 
@@ -245,7 +247,7 @@ class Editor:
         return not self.unsaved and self.people.can_redo(self.person)
 
     def draft(self, name: str, edits: Edits, gesture: object) -> None:
-        """Change the draft.
+        """Change the draft. Later edits of other users remain where the draft does not change the saved value.
 
         Args:
             name: name of the step that the draft becomes.
@@ -253,7 +255,9 @@ class Editor:
             gesture: identifies the draft; an earlier draft that could not be saved is merged into this one.
         """
         self._name, self._gesture = name, gesture
-        self._edits = {**self._edits, **edits}
+        if self._view is None:
+            self._base = self.project.state
+        self._edits = {**self._edits, **_rebased(edits, self.project.state, self._base)}
         self._changed_at = time.monotonic()
         self._lay_draft()
 
@@ -271,7 +275,7 @@ class Editor:
             return
         # If the disk is full, the next attempt is made only after a pause.
         self._changed_at = time.monotonic()
-        self.apply(self._name, self._edits, figures)
+        self.apply(self._name, _rebased(self._edits, self._base, self.project.state), figures)
         self.drop()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
@@ -321,5 +325,22 @@ class Editor:
 
     def _lay_draft(self) -> None:
         saved = self.project.state
-        edits = {**self._edits, **saved.changed(self._edits)}
+        edits = _rebased(self._edits, self._base, saved)
+        edits = {**edits, **saved.changed(edits)}
         self._view = saved, saved.after(Step(saved.position + 1, self._name, time.time()), edits)
+
+
+def _rebased(edits: Edits, start: ProjectState, end: ProjectState) -> Edits:
+    """Edits with values as in `start` replaced by those in `end`; state and note of a review are separate values."""
+    if start is end:
+        return edits
+    rebased = dict(edits)
+    for key, value in edits.items():
+        if key.kind is Kind.REVIEW:
+            own, old, new = value or Review(), start.review(key.frame), end.review(key.frame)
+            state, note = own.state if own.state is not old.state else new.state, own.note
+            review = Review(state, note if note != old.note else new.note)
+            rebased[key] = None if review == Review() else review
+        elif value == start.get(key):
+            rebased[key] = end.get(key)
+    return rebased

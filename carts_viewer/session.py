@@ -165,15 +165,17 @@ class Session:
             state: its new pose.
             provenance: provenance of the changed values.
             joint_std: arm -> standard deviations [rad, m], NaN if unknown.
-            free: free parameters; groups of the calibration that are not free are not edited, since `state` may contain
-                an earlier calibration.
+            free: free parameters; other arms and groups of the calibration are not edited, since `state` may contain
+                their earlier values.
         """
         saved = self.editor.project.state
         before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured, None, frame.mounts)
         edits: dict[Key[Any], Any] = {}
         for row, arm in enumerate(self.scene.arms):
             key, values = Key.joints(frame.index, arm.name), state.joint_positions[row]
-            if np.array_equal(values, before.joint_positions[row]):
+            if not any(free.frees(arm.name, joint) for joint in arm.robot.joint_names):
+                pass
+            elif np.array_equal(values, before.joint_positions[row]):
                 edits[key] = saved.get(key)
             elif np.array_equal(values, measured.joint_positions[row]):
                 edits[key] = None

@@ -97,12 +97,7 @@ class Variables:
         self, scene: Scene, index: int, free: FreeParameters, lower: list[float], upper: list[float]
     ) -> None:
         arm = scene.arms[index]
-        locked = set(free.locked_joints)
-        columns = tuple(
-            column
-            for column, joint in enumerate(arm.robot.joint_names)
-            if joint not in locked and f"{arm.name}/{joint}" not in locked
-        )
+        columns = tuple(column for column, joint in enumerate(arm.robot.joint_names) if free.frees(arm.name, joint))
         if not columns:
             return
         start = self.start.joint_positions[index].cpu()

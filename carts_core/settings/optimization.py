@@ -122,6 +122,11 @@ class FreeParameters:
     locked_cameras: tuple[str, ...] = ()
     """Cameras with fixed extrinsics."""
 
+    def frees(self, arm: str, joint: str) -> bool:
+        """Whether a joint of an arm is free."""
+        chosen = self.joints and (not self.arms or arm in self.arms)
+        return chosen and joint not in self.locked_joints and f"{arm}/{joint}" not in self.locked_joints
+
     @property
     def joints_only(self) -> bool:
         """Whether only joints are free, without calibration parameters."""

@@ -10,6 +10,7 @@ from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
 from carts_core.project import Edits, Figures, Kind, Provenance, Source
 from carts_core.project.values import WHOLE_PROJECT
+from carts_core.settings import FreeParameters
 from carts_viewer.actions.intents import Intent
 from carts_viewer.picture.overlay import OverlayRenderer, with_imported
 from carts_viewer.session import Session
@@ -65,13 +66,21 @@ class Context:
             self.run.end(reason)
 
     def set_pose(
-        self, name: str, scene: SceneState, *, gesture: object = None, source: Source = Source.HAND, pins: bool = False
+        self,
+        name: str,
+        scene: SceneState,
+        *,
+        arms: tuple[str, ...] = (),
+        gesture: object = None,
+        source: Source = Source.HAND,
+        pins: bool = False,
     ) -> None:
         """Set the pose of the shown frame; no run may be active.
 
         Args:
             name: name of the step in the history.
             scene: the pose.
+            arms: the moved arms; empty for all arms.
             gesture: edits of the same gesture are one step, saved when it ends; None for a complete gesture.
             source: origin of the pose.
             pins: whether the pose was fitted to pins; otherwise all pins are removed.
@@ -81,7 +90,8 @@ class Context:
         """
         if not pins:
             self.remove_pins()
-        self.edit(name, self.session.edits(self.state.frame, scene, Provenance(source)), gesture=gesture)
+        edits = self.session.edits(self.state.frame, scene, Provenance(source), free=FreeParameters(arms=arms))
+        self.edit(name, edits, gesture=gesture)
 
     def edit(
         self,

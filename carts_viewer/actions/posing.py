@@ -23,7 +23,7 @@ class PosingHandler(Handler):
         self._context.change(joint=(intent.arm, intent.joint))
         # All changes of one joint until the slider is released are one undo step.
         gesture = (intents.SetJoint, intent.arm, intent.joint)
-        self._set_pose(f"Move {self._joint_name()}", scene, gesture=gesture)
+        self._set_pose(f"Move {self._joint_name()}", scene, (intent.arm,), gesture)
 
     def _on_ChooseJoint(self, intent: intents.ChooseJoint) -> None:
         joints = [(arm.name, joint) for arm in self._session.scene.arms for joint in range(len(arm.robot.joint_names))]
@@ -39,7 +39,7 @@ class PosingHandler(Handler):
         by = clamped(intent.by, -MAX_PERTURBATION, MAX_PERTURBATION)
         step = math.radians(by) if self._session.ranges[arm][joint].revolute else by / 1e3
         now = self._session.joints(pose)[arm][joint]
-        self._set_pose(f"Nudge {self._joint_name()}", self._session.with_joint(pose, arm, joint, now + step))
+        self._set_pose(f"Nudge {self._joint_name()}", self._session.with_joint(pose, arm, joint, now + step), (arm,))
 
     def _on_BackToMeasured(self, intent: intents.BackToMeasured) -> None:
         self._context.end_run("Stopped: the pose was changed by hand")
@@ -53,9 +53,9 @@ class PosingHandler(Handler):
         scene = self._session.perturbed(state.pose.scene, state.index, degrees, intent.seed)
         self._set_pose(f"Perturb by {degrees:g}°", scene)
 
-    def _set_pose(self, name: str, scene: SceneState, gesture: object = None) -> None:
+    def _set_pose(self, name: str, scene: SceneState, arms: tuple[str, ...] = (), gesture: object = None) -> None:
         self._context.end_run("Stopped: the pose was changed by hand")
-        self._context.set_pose(name, scene, gesture=gesture)
+        self._context.set_pose(name, scene, arms=arms, gesture=gesture)
 
     def _joint(self) -> tuple[str, int]:
         return self._context.state.joint or (self._session.scene.arms[0].name, 0)
@@ -107,7 +107,7 @@ class DraggingHandler(Handler):
         fit = fit_keypoints(scene, start, [Pin(point, camera.name, pixel)])
         self._context.end_run("Stopped: the pose was changed by hand")
         link = point.name.removesuffix("_link").replace("_", " ")
-        context.set_pose(f"Drag {point.arm} {link}", fit.state, gesture=gesture)
+        context.set_pose(f"Drag {point.arm} {link}", fit.state, arms=(point.arm,), gesture=gesture)
 
     def _take(self, intent: intents.DragLink) -> None:
         """Pick the link under the pointer."""

@@ -80,9 +80,9 @@ class AnnotatingHandler(Handler):
         self._review(intent.state)
 
     def _on_SetNote(self, intent: intents.SetNote) -> None:
-        state = self._context.state
-        review = Review(state.review.state, str(intent.note)[:MAX_NOTE_LENGTH])
-        self._mark("Note", review, gesture=(intents.SetNote, state.index))
+        index = self._context.state.index
+        state = self._session.editor.view.review(index).state
+        self._mark("Note", Review(state, str(intent.note)[:MAX_NOTE_LENGTH]), gesture=(intents.SetNote, index))
 
     def _on_AcceptAndNext(self, intent: intents.AcceptAndNext) -> None:
         self._context.change(notice=None)
@@ -120,7 +120,7 @@ class AnnotatingHandler(Handler):
         self._worst = order[place]
 
     def _review(self, state: ReviewState) -> None:
-        note = self._context.state.review.note
+        note = self._session.editor.view.review(self._context.state.index).note
         self._mark(_REVIEW_STEPS[state], Review(state, note))
 
     def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
@@ -177,7 +177,8 @@ class AnnotatingHandler(Handler):
         placed = replace(state.keypoints, shown=True, pins=pins, residuals=fit.residuals)
         self._context.change(keypoints=placed)
         gesture = (intents.PointAt, pin.keypoint, pin.camera)
-        self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
+        arms = tuple({pin.keypoint.arm for pin in pins})
+        self._context.set_pose(f"Place {self._held}", fit.state, arms=arms, gesture=gesture, pins=True)
 
     def _moved_since(self, scene: SceneState) -> bool:
         """Whether arms or cameras were moved, for example by a run or a calibration, since arms were fitted to pins."""

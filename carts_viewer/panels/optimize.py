@@ -225,7 +225,7 @@ class FreePanel:
                 gui.add_html(f'<p class="carts-caption"><b>{escaped(arm.name)}</b> joints</p>')
                 for joint in arm.robot.joint_names:
                     hint = f"Allow the optimizer to move this joint of {arm.name}"
-                    box = gui.add_checkbox(humanized(joint), is_free(state, arm.name, joint), hint=hint)
+                    box = gui.add_checkbox(humanized(joint), state.free.frees(arm.name, joint), hint=hint)
                     self._joints[arm.name, joint] = box
                     page.on_input(box, lambda on, arm=arm.name, joint=joint: intents.SetFreeJoint(arm, joint, bool(on)))
                 page.columns([self._joints[arm.name, joint] for joint in arm.robot.joint_names])
@@ -239,16 +239,9 @@ class FreePanel:
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
         for (arm, joint), box in self._joints.items():
-            write(box, is_free(state, arm, joint))
+            write(box, state.free.frees(arm, joint))
         for name, box in self._groups.items():
             write(box, getattr(state.free, name))
-
-
-def is_free(state: ViewState, arm: str, joint: str) -> bool:
-    """Whether the optimizer may move this joint."""
-    locked = state.free.locked_joints
-    chosen = not state.free.arms or arm in state.free.arms
-    return state.free.joints and chosen and joint not in locked and f"{arm}/{joint}" not in locked
 
 
 def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:

@@ -12,13 +12,24 @@ from viewer_desk import Desk
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import Keypoint, project_keypoints
 from carts_core.model.scene import Scene
-from carts_core.project import CorrectedTransform, Figures, Key, Kind, Project, Provenance, Review, ReviewState, Source
+from carts_core.project import (
+    CorrectedTransform,
+    Figures,
+    JointCorrection,
+    Key,
+    Kind,
+    Project,
+    Provenance,
+    Review,
+    ReviewState,
+    Source,
+)
 from carts_core.recording import Sequence
 from carts_core.settings import FreeParameters
 from carts_viewer.actions import intents
 from carts_viewer.editing import People
 from carts_viewer.picture.overlay import keypoints_in_image, labelled_keypoints
-from carts_viewer.session import Session
+from carts_viewer.session import Session, joint_correction
 from carts_viewer.state import Phase, Pose, ViewState
 
 
@@ -369,6 +380,57 @@ def people(tiny_sequence) -> People:
 
 def _reviews(people: People) -> list[str]:
     return [str(people.project.state.review(frame).state) for frame in range(4)]
+
+
+def _two_arms(text: str) -> str:
+    arm = text[text.index("[[arms]]") : text.index("[[cameras]]")]
+    return text.replace(arm, arm + arm.replace("PSM1", "PSM2"))
+
+
+def test_gestures_runs_and_notes_leave_what_another_tab_changes_meanwhile(
+    tiny_sequence: Callable[..., Path], untrained_weights: Path
+) -> None:
+    desk = Desk.open(tiny_sequence(edit=_two_arms), weights=(untrained_weights,))
+    people, joints = desk.session.editor.people, desk.session.joints(desk.state.pose.scene)
+    bob, own, other = people.join(), "PSM1", "PSM2"
+
+    def correct(value: float) -> JointCorrection:
+        correction = joint_correction(np.array([value, *joints[other][1:]]), HAND)
+        people.apply(bob, "Correct", {Key.joints(0, other): correction})
+        return correction
+
+    # The second arm is moved out of the way of the first one.
+    correct(0.4)
+    desk.controller.follow()
+    place, point = _taken(desk)
+    assert point.arm == own
+
+    def drag(by: float) -> intents.Intent:
+        return intents.DragLink(1.0, "left", place, (place[0] + by, place[1]))
+
+    def move(by: float) -> intents.Intent:
+        return intents.SetJoint(own, 0, joints[own][0] + by / 100)
+
+    for number, gesture in enumerate((drag, move), start=2):
+        desk.do(gesture(5.0))
+        correct(0.4 + 0.01 * number)
+        desk.do(gesture(8.0))
+        expected = correct(0.5 + 0.01 * number)
+        desk.do(gesture(9.0), intents.Released())
+        assert desk.saved.joints(0)[other] == expected and desk.saved.position == 3 * number - 2
+    desk.do(*(intents.SetFreeJoint(other, name, False) for name in desk.session.scene.arm(other).robot.joint_names))
+    desk.do(intents.Run())
+    desk.advance()
+    expected = correct(0.6)
+    desk.finish()
+    assert desk.saved.joints(0)[other] == expected and "Optimize" in desk.saved.steps[-1].name
+    # State and note of a review are separate.
+    desk.do(intents.SetNote("half"))
+    people.apply(bob, "Accept", {Key.review(0): ACCEPTED})
+    desk.do(intents.SetNote("half hidden"))
+    people.apply(bob, "Reject", {Key.review(0): REJECTED})
+    desk.do(intents.Released())
+    assert desk.saved.review(0) == Review(ReviewState.REJECTED, "half hidden")
 
 
 def test_what_somebody_else_has_changed_since_is_not_taken_back(people: People) -> None:
