@@ -32,7 +32,8 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ViewerApp]:
     # Without times of its images, a replay has a field for their rate.
     lines = (folder / "sequence.toml").read_text().splitlines()
     (folder / "sequence.toml").write_text("\n".join(line for line in lines if not line.startswith("timestamp")) + "\n")
-    with ViewerApp.open(folder / "sequence.toml", port=0) as app:
+    with pytest.MonkeyPatch.context() as patch, ViewerApp.open(folder / "sequence.toml", port=0) as app:
+        patch.setattr(tabs, "RECONNECT_TIME", 1e6)  # Streams of the first tab go on after its page was closed.
         app.wait_until_shown(SECONDS)
         yield app
 
