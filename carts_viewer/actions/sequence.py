@@ -237,15 +237,15 @@ class PropagatingHandler(Handler):
         self._context.end_run("Stopped: solved poses were taken")
         self._context.save()
         edits: dict[Key[Any], Any] = {}
-        for index, outcome in taken.items():
+        for outcome in taken.values():
             edits.update(outcome.edits)
-            del self._held[index]
         figures = {index: outcome.figures for index, outcome in taken.items()}
         if not now.same_calibration(self._before):
             # Verdicts and figures refer to the earlier calibration.
             edits, figures = {**edits, **{Key.verdict(index): None for index in taken}}, {}
         people, name = self._session.editor.people, f"Take {counted(len(taken), 'solved pose')}"
         people.apply(self.person, name, edits, figures)
+        self._held = {index: outcome for index, outcome in self._held.items() if index not in taken}
         listed = self._context.state.solve.listed if self._context.state.solve else ()
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()

@@ -73,6 +73,14 @@ def sources(desk: Desk) -> list[Source | None]:
     return [None if correction is None else correction.provenance.source for correction in found]
 
 
+def hold_back(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Solve the first two frames, whose results count as worse and are not applied."""
+    monkeypatch.setattr(comparison, "worse_than", lambda fit, other: "loss")
+    desk.do(intents.SetRange((0, 1)), intents.Solve(whole=True))
+    desk.finish()
+    assert sources(desk) == [None] * FRAMES
+
+
 def test_frames_between_keyframes_are_solved_in_one_step_and_keyframes_stay(desk: Desk) -> None:
     kept = hand_made(desk, 0, 3)
     desk.do(intents.ShowFrame(1), intents.Solve())
@@ -263,10 +271,7 @@ def test_a_suspicion_against_base_frames_is_said_when_frames_were_solved_until_t
 def test_a_solved_pose_is_taken_by_its_user_without_what_another_calibration_said_of_it(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison, "worse_than", lambda fit, other: "loss")
-    desk.do(intents.SetRange((0, 1)), intents.Solve(whole=True))
-    desk.finish()
-    assert sources(desk) == [None] * FRAMES
+    hold_back(desk, monkeypatch)
     desk.do(intents.TakeSolved(0))
     assert desk.saved.verdict(0) is not None and desk.saved.figures(0) is not None
     camera, editor = desk.session.scene.cameras[0], desk.session.editor
@@ -279,6 +284,20 @@ def test_a_solved_pose_is_taken_by_its_user_without_what_another_calibration_sai
     # The other user's step is not undone.
     desk.do(intents.Undo())
     assert sources(desk)[:2] == [None, Source.PROPAGATED]
+
+
+def test_a_solved_pose_that_could_not_be_saved_can_be_taken_again(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold_back(desk, monkeypatch)
+
+    def fail(*_: object) -> None:
+        raise ProjectError("The disk is full.")
+
+    with monkeypatch.context() as full, pytest.raises(ProjectError, match="The disk is full"):
+        full.setattr(desk.session.editor.people, "apply", fail)
+        desk.do(intents.TakeSolved(0))
+    assert sources(desk)[:2] == [None] * 2
+    desk.do(intents.TakeSolved(0))
+    assert sources(desk)[:2] == [Source.PROPAGATED, None]
 
 
 # ---- Random sets of keyframes ---------------------------------------------------------------------------------------
