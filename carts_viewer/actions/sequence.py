@@ -97,8 +97,8 @@ class PropagatingHandler(Handler):
             raise CartsError("There is no keyframe yet. Correct a frame by hand, accept a frame, or solve all frames.")
         if len(kept) == len(frames):
             raise CartsError("All of these frames are keyframes or accepted, so there is nothing to solve.")
+        former, before, held = self._context.state.solve, self._before, self._held
         self._before = view
-        former = self._context.state.solve
         self._context.change(playing=False, error=None, solve=SolveState(frames, text="Preparing"))
         self._optimizers.report("Preparing to solve")
         try:
@@ -106,6 +106,8 @@ class PropagatingHandler(Handler):
             self._work, self._reply = self._steps(self._run), None
             self.advance()
         except Exception:
+            # The list of the former run remains, so its poses can still be taken.
+            self._before, self._held = before, held
             self._context.change(solve=former)
             raise
 

@@ -300,6 +300,27 @@ def test_a_solved_pose_that_could_not_be_saved_can_be_taken_again(desk: Desk, mo
     assert sources(desk)[:2] == [Source.PROPAGATED, None]
 
 
+@pytest.mark.parametrize("step", ["_make", "_take"])
+def test_the_list_of_a_solve_is_used_as_before_when_another_one_cannot_be_started(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    hold_back(desk, monkeypatch)
+    kept = hand_made(desk, 0)
+
+    def fail(*_: object) -> None:
+        raise CartsError("The solver is gone.")
+
+    with monkeypatch.context() as gone, pytest.raises(CartsError, match="The solver is gone"):
+        gone.setattr(PropagatingHandler, step, fail)
+        desk.do(intents.Solve(whole=True))
+    # The edited frame is not overwritten.
+    with pytest.raises(CartsError, match="the frame was changed since"):
+        desk.do(intents.TakeSolved(0))
+    desk.do(intents.TakeSolved())
+    assert sources(desk)[:2] == [Source.HAND, Source.PROPAGATED]
+    assert desk.saved.joints(0)["PSM1"].joint_positions[0] == kept[0]
+
+
 # ---- Random sets of keyframes ---------------------------------------------------------------------------------------
 
 WORSE = 0.005
