@@ -100,7 +100,7 @@ def _stages(tables: Any, where: str) -> tuple[Stage, ...]:
 def _stage(table: Mapping[str, Any], where: str) -> Stage:
     rest = dict(table)
     name = rest.pop("stage", None)
-    if name not in _STAGES:
+    if not isinstance(name, str) or name not in _STAGES:
         raise SettingsError(f"{where} has the stage {name!r}; allowed: {', '.join(_STAGES)}.")
     if name == "Descend" and "blur" not in rest:
         raise SettingsError(f"{where} (Descend) requires a blur [px], such as 1.6.")

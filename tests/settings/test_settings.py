@@ -57,6 +57,7 @@ def test_single_settings_need_no_file() -> None:
         ("[[solver.stages]]\nstage = 'SilhouetteSearch'\nenough = -1.0", "enough is -1.0; allowed: 0 to 1000 px"),
         ("[[solver.stages]]\nstage = 'RandomRestart'\nscale = 0.0\nthen = []", "scale is 0.0; allowed: 0.1 to 8"),
         ("[[solver.stages]]\nstage = 'Dance'", "has the stage 'Dance'; allowed: Observe, Descend"),
+        ("[[solver.stages]]\nstage = []", r"has the stage \[\]; allowed: Observe, Descend"),
         ("[[solver.stages]]\nstage = 'Descend'", "requires a blur"),
         ("[[solver.stages]]\nstage = 'Descend'\nblur = 2.0\nspeed = 1", "has no setting 'speed'.*Settings: blur"),
         ("[solver]\nstages = 3", "must be a list of tables"),
