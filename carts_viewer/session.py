@@ -31,8 +31,9 @@ from carts_core.project.state import calibrated_scene, corrected_state, source_o
 from carts_core.recording import Frame, FrameReader, Sequence
 from carts_core.settings import FreeParameters
 from carts_viewer.editing import Editor, People, Person
+from carts_viewer.jobs.choices import Observed
 from carts_viewer.start.roots import Roots
-from carts_viewer.state import NETWORK, Observed, Pose, Target, joint_range
+from carts_viewer.state import NETWORK, Pose, Target, joint_range
 
 _JOINTS_ALONE = FreeParameters()
 

@@ -2,16 +2,15 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
-from carts_core.errors import SettingsError
 from carts_core.model.keypoints import Pin
 from carts_core.model.scene import Arm, SceneState
 from carts_core.optimization import FreeParameters, GivenMasks, Iterate, SolverSettings
@@ -24,6 +23,7 @@ from carts_core.settings import Direction, SolverName, SurfaceSolver
 from carts_core.settings.stages import reduced
 
 from .actions.frame_filter import FrameFilter
+from .jobs.choices import Choices, Observed
 from .jobs.job_list import Job
 from .picture.layers import Layer
 from .picture.strokes import Brush
@@ -118,34 +118,11 @@ def joint_range(arm: Arm, joint: int) -> JointRange:
     )
 
 
-Observe = Literal["network", "masks", "both"]
-Masks = Literal["recording", "imported", "painted"]
-
-
-@dataclass(frozen=True)
-class Observed:
-    """The user's choice of the target of a run.
-
-    Raises:
-        SettingsError: a value is not one of the choices.
-    """
-
-    what: Observe = "network"
-    """The target, as in `--observe`."""
-    masks: Masks = "recording"
-    """Source of the masks, if masks are fitted; as in `--masks`."""
-
-    def __post_init__(self) -> None:
-        for value, allowed in ((self.what, get_args(Observe)), (self.masks, get_args(Masks))):
-            if value not in allowed:
-                raise SettingsError(f"{value!r} is not a target of runs. Choose one of: {', '.join(allowed)}.")
-
-
 @dataclass(frozen=True, eq=False)
 class Target:
     """Target of a run: network predictions or masks. Masks of the project are those at the start of the run."""
 
-    observed: Observed = Observed()
+    observed: Observed = field(default_factory=Observed)
     project: ProjectState | None = None
     """Project with the masks, if they are not those of the recording."""
     recording: Recording | None = None
@@ -496,6 +473,11 @@ class ViewState:
     """A message that is not an error."""
     imported: str = ""
     """Summary of the last import of masks, as text for the user."""
+
+    @property
+    def choices(self) -> Choices:
+        """Choices that jobs of this tab use."""
+        return Choices(**{choice.name: getattr(self, choice.name) for choice in fields(Choices)})
 
     @property
     def part(self) -> Frames:

@@ -283,7 +283,7 @@ class SetObserved(Optimizing, Latest):
     """Set the target of runs: predictions of the network, masks or both."""
 
     what: str
-    """One of `state.Observe`."""
+    """One of `jobs.choices.Observe`."""
     masks: str
     """One of `state.Masks`."""
 

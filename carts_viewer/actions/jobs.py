@@ -11,11 +11,12 @@ from carts_core.errors import CartsError
 from carts_core.project import frames_in
 from carts_core.project.state import UNREVIEWED
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, Handler
+from carts_viewer.actions.context import Context, Handler, one_of
 from carts_viewer.actions.frame_filter import matching_frames
 from carts_viewer.actions.import_export import ExportingHandler
 from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.editing import Person
+from carts_viewer.jobs.choices import Choices
 from carts_viewer.jobs.companions import Decisions
 from carts_viewer.jobs.comparison import Comparison, Waiting
 from carts_viewer.jobs.job_list import (
@@ -38,8 +39,6 @@ _END = Progress(0, 0, "")
 """End of a job's steps."""
 _SAVE_INTERVAL = 5.0
 """Interval between saves of a job's progress [s]."""
-_CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
-"""Fields of a tab's state that a job depends on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +49,9 @@ class JobRequester:
     state: ViewState
 
     def choose(self, context: Context) -> None:
-        """Set the user and the inputs of a job in its context."""
+        """Set the user and the shown frame of a job in its context."""
         context.session.editor.person = self.person
-        context.change(**{name: getattr(self.state, name) for name in _CHOICES})
+        context.change(index=self.state.index, frame=self.state.frame, pose=self.state.pose)
 
 
 class JobsHandler(Handler):
@@ -78,6 +77,8 @@ class JobsHandler(Handler):
             recording=identity.kinematics_sha256,
             decisions=decisions,
         )
+        self._defaults = context.state.choices
+        """Choices of jobs without any, which an earlier version has stored."""
         self._requester: JobRequester | None = None
         """User whose request is being carried out."""
         self._asked: dict[int, JobRequester] = {}
@@ -103,7 +104,7 @@ class JobsHandler(Handler):
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     def _on_Solve(self, intent: intents.Solve) -> None:
-        state = self._choices
+        state = self._tab
         self._queue("solve", {**msgspec.structs.asdict(intent), "at": state.index, "range": state.range})
 
     def _on_Export(self, intent: intents.Export) -> None:
@@ -134,6 +135,8 @@ class JobsHandler(Handler):
         for job in self._list.jobs:
             if job.state is JobState.ASKED and intent.accepted:
                 self._list.accept(job.number, self._safe_options(job))
+                if self._requester is not None:
+                    self._asked[job.number] = self._requester
             elif job.state is JobState.ASKED:
                 self._end(job, JobState.CANCELLED, "Discarded before the start.")
         self._publish()
@@ -152,7 +155,7 @@ class JobsHandler(Handler):
         options = self._safe_options(job)
         if isinstance(options, OptimizeOptions):
             options = replace(options, first=job.done if job.state is not JobState.DONE else 0)
-        self._queue(job.kind, asdict(options))
+        self._queue(job.kind, asdict(options), job.choices)
 
     def _on_RemoveEndedJobs(self, intent: intents.RemoveEndedJobs) -> None:
         self._list.forget()
@@ -193,8 +196,9 @@ class JobsHandler(Handler):
             self._work.close()
         self._list.save()
 
-    def _queue(self, kind: str, values: dict[str, Any]) -> None:
-        job = self._list.add(kind, values)
+    def _queue(self, kind: str, values: dict[str, Any], choices: Choices | None = None) -> None:
+        """Queue a job, by default with the choices of the requester's tab."""
+        job = self._list.add(kind, values, choices or self._tab.choices)
         if self._requester is not None:
             self._asked[job.number] = self._requester
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
@@ -215,6 +219,7 @@ class JobsHandler(Handler):
         if requester is not None:
             requester.choose(self._context)
         try:
+            self._choose(job.choices or self._defaults)
             # The project, such as its calibration, may have changed since the job was queued.
             self._context.refresh()
             match job.options:
@@ -229,6 +234,17 @@ class JobsHandler(Handler):
             self._end(job, JobState.FAILED, str(error))
             raise
         self._publish()
+
+    def _choose(self, choices: Choices) -> None:
+        """Set the choices of a job in its context.
+
+        Raises:
+            CartsError: the recording does not have the domain or the camera.
+        """
+        sequence = self._context.session.sequence
+        one_of(choices.domain, "", sequence.domains, "domain")
+        one_of(choices.camera, "", [camera.name for camera in sequence.scene.cameras], "camera")
+        self._context.change(**vars(choices))
 
     def _own(self, options: OptimizeOptions | CalibrateOptions | AdaptOptions) -> Generator[Progress | Waiting]:
         match options:
@@ -313,9 +329,9 @@ class JobsHandler(Handler):
     def _frames(self, which: str) -> list[int]:
         view = self._context.session.editor.view
         if which == "found":
-            frames = matching_frames(view, self._choices.filter)
+            frames = matching_frames(view, self._tab.filter)
         elif which == "range":
-            first, last = self._choices.range or (0, len(self._context.session.sequence) - 1)
+            first, last = self._tab.range or (0, len(self._context.session.sequence) - 1)
             frames = list(range(first, last + 1))
         elif which == "all":
             frames = list(range(len(self._context.session.sequence)))
@@ -326,7 +342,7 @@ class JobsHandler(Handler):
         return frames
 
     @property
-    def _choices(self) -> ViewState:
+    def _tab(self) -> ViewState:
         return self._context.state if self._requester is None else self._requester.state
 
     def _publish(self) -> None:

@@ -15,11 +15,12 @@ from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
+from carts_viewer.jobs.choices import Observed
 from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, provenance, wait_for
 from carts_viewer.jobs.solver import Advanced, Ended, Fit, FrameTask, RefineTask, Started
 from carts_viewer.jobs.solver_process import Reply, SolverStopped
 from carts_viewer.picture.layers import Layer
-from carts_viewer.state import PRESETS, Curves, Maps, Observed, Phase, Pose, RefinedMasks, RunState, Scores
+from carts_viewer.state import PRESETS, Curves, Maps, Phase, Pose, RefinedMasks, RunState, Scores
 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",

@@ -16,6 +16,8 @@ from carts_core.export import FORMATS, FormatName, Parts
 from carts_core.files import output_path, write_text
 from carts_core.files.reading import Kind, parse_json, read_text, typed
 from carts_core.settings import Masks
+from carts_core.settings.serialization import to_plain
+from carts_viewer.jobs.choices import Choices, read_choices
 from carts_viewer.jobs.companions import Decisions, set_aside_damaged
 
 _MAX_ENDED = 50
@@ -179,7 +181,7 @@ class Job:
     title: str
     """Title, as text for the user."""
     options: Options
-    """All data to repeat the job, together with its kind."""
+    """All data to repeat the job, together with its kind and choices."""
     state: JobState = JobState.WAITING
     done: Annotated[int, msgspec.Meta(ge=0)] = 0
     total: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -191,7 +193,9 @@ class Job:
     """Progress or result, as text for the user."""
     log: tuple[str, ...] = ()
     token: str = ""
-    """Random token; with kind, options and recording it identifies the jobs that this user has queued."""
+    """Random token; with kind, options, choices and recording it identifies the jobs that this user has queued."""
+    choices: Choices | None = None
+    """Choices of the tab that queued the job; None in lists of earlier versions, for those of a new tab."""
 
     @property
     def over(self) -> bool:
@@ -216,6 +220,7 @@ class _Row(Job):
     """A job in the format of the file."""
 
     options: dict[str, Any] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleVariableOverride]
+    choices: dict[str, Any] | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 class JobList:
@@ -236,18 +241,20 @@ class JobList:
         self.problem = self.unsaved = ""
         self.jobs: tuple[Job, ...] = tuple(map(self._resumed, self._read()))
 
-    def add(self, kind: str, values: Mapping[str, Any]) -> Job:
-        """Queue a job.
+    def add(self, kind: str, values: Mapping[str, Any], choices: Choices | None = None) -> Job:
+        """Queue a job with the choices of a tab.
 
         Raises:
             CartsError: the kind or an option is invalid, or the list cannot be written.
         """
         try:
             options = read_options(kind, values, len(self._frame_ids))
+            # The same values as after a restart, since they identify the job.
+            choices = None if choices is None else read_choices(to_plain(choices))
         except ValueError as error:
             raise CartsError(f"This job cannot be queued: {error}. Choose its options again.") from error
         number = max((job.number for job in self.jobs), default=0) + 1
-        job = self._own(Job(number, kind, job_title(options, self._frame_ids), options))
+        job = self._own(Job(number, kind, job_title(options, self._frame_ids), options, choices=choices))
         ended = [job for job in self.jobs if job.over]
         self._drop(ended[: max(len(ended) - _MAX_ENDED, 0)])
         self.jobs = (*self.jobs, job)
@@ -307,7 +314,9 @@ class JobList:
         return job
 
     def _identity(self, job: Job) -> bytes:
-        return json.dumps([self._recording, job.token, job.kind, asdict(job.options)], sort_keys=True).encode()
+        chosen = [] if job.choices is None else [to_plain(job.choices)]
+        values = [self._recording, job.token, job.kind, asdict(job.options), *chosen]
+        return json.dumps(values, sort_keys=True).encode()
 
     def _drop(self, dropped: Sequence[Job]) -> None:
         for job in dropped:
@@ -317,7 +326,7 @@ class JobList:
 
     def _write(self) -> None:
         if self._path is not None:
-            write_text(self._path, json.dumps([asdict(job) for job in self.jobs], indent=1))
+            write_text(self._path, json.dumps([to_plain(job) for job in self.jobs], indent=1))
 
     def _read(self) -> list[Job]:
         """The jobs of the file; a damaged file is set aside and a new list started."""
@@ -339,12 +348,13 @@ class JobList:
 
     def _job(self, row: _Row) -> Job:
         options = read_options(row.kind, row.options, len(self._frame_ids))
+        choices = None if row.choices is None else read_choices(row.choices)
         texts = {
             "text": row.text[:_MAX_TEXT],
             "log": tuple(line[:_MAX_TEXT] for line in row.log[-_MAX_LOG:]),
         }
         title = job_title(options, self._frame_ids)
-        return Job(**{**vars(row), **texts, "options": options, "title": title})
+        return Job(**{**vars(row), **texts, "options": options, "choices": choices, "title": title})
 
     def _resumed(self, job: Job) -> Job:
         """A job after a restart: a waiting job of another user needs confirmation, and a running job has failed."""

@@ -22,7 +22,10 @@ from carts_core.cli.batch_job import BatchWork
 from carts_core.files import output_path
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.identity import data_dir
+from carts_core.settings import FreeParameters, SolverName, solver
 from carts_core.settings.interchange import ImportOptions
+from carts_core.settings.serialization import to_plain
+from carts_viewer.jobs.choices import Choices, Observed
 from carts_viewer.jobs.job_list import Job, JobState
 from carts_viewer.jobs.networks import STARTED
 from carts_viewer.start.site import Site
@@ -130,15 +133,23 @@ def job(number: int, kind: str, **options: Any) -> dict[str, Any]:
     return row | {"options": options, "state": "waiting", "token": "0" * 32}
 
 
+CHOICES = Choices(
+    *("regular", "left", True, SolverName.ACS),
+    *(solver("acs"), FreeParameters(arms=("PSM1",)), Observed(), "forward"),
+)
 JOBS = [
     job(1, "adapt", minutes=15, folder=1, first=0),
     job(2, "solve", whole=True, at=0, range=[0, 1]),
     job(3, "export", format="csv", frames="All", parts="arms", images=True, shown_camera=False, range=[0, 1]),
     job(4, "optimize", frames=[0, 1], first=0),
-    job(5, "calibrate", frames=20),
+    job(5, "calibrate", frames=20) | {"choices": to_plain(CHOICES)},
 ]
 """Of another user; all of them wait."""
-JOB_PLACES = [*places(JOBS), *((row, "options", *way) for row in range(1, 5) for way in places(JOBS[row]["options"]))]
+JOB_PLACES = [
+    *places(JOBS),
+    *((row, "options", *way) for row in range(1, 5) for way in places(JOBS[row]["options"])),
+    *((4, "choices", *way) for way in places(JOBS[4]["choices"])),
+]
 POINT = asdict(ImagePoint(0, "left", "PSM1", "wrist", (10.0, 20.0)))
 OPTIONS = asdict(
     ImportOptions(

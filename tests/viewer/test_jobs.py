@@ -21,9 +21,12 @@ from carts_core.networks.weights import read_weights, save_weights
 from carts_core.project import ReviewState, Source
 from carts_core.project.identity import data_dir
 from carts_core.resources import shipped_weights
+from carts_core.settings import FreeParameters, SolverName, solver
+from carts_core.settings.serialization import to_plain
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.jobs import work
+from carts_viewer.jobs.choices import Choices, Observed, read_choices
 from carts_viewer.jobs.companions import Decisions
 from carts_viewer.jobs.job_list import (
     AdaptOptions,
@@ -38,6 +41,7 @@ from carts_viewer.jobs.job_list import (
 )
 from carts_viewer.jobs.networks import STARTED, Networks
 from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.solver import FrameTask
 from carts_viewer.panels.jobs import job_line, jobs_question
 from tools.raw_tab import RawTab
 
@@ -86,6 +90,89 @@ def test_what_was_chosen_for_a_job_is_forgotten_with_the_job(desk: Desk) -> None
     assert frame() is None
 
 
+@pytest.fixture
+def tasks(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> list[FrameTask]:
+    """Tasks of all runs on single frames."""
+    found, run = [], desk.factory.run
+    monkeypatch.setattr(desk.factory, "run", lambda task: (found.append(task), run(task))[1])
+    return found
+
+
+CHOSEN = (
+    intents.SetSetting("solver", "surface"),
+    intents.SetSetting("iterations", 2),
+    intents.SetObserved("masks", "recording"),
+    intents.SetFreeJoint("PSM1", "roll", False),
+    intents.ShowDomain("smoke"),
+    intents.ShowCamera("right"),
+)
+
+
+def used(tasks: list[FrameTask]) -> set[tuple[Any, ...]]:
+    """What the tasks of runs were made with."""
+    return {(task.domain, task.settings, task.free, task.target.observed) for task in tasks}
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_jobs_use_what_was_chosen_when_they_were_queued_also_after_a_restart_and_elsewhere(
+    desk: Desk, tasks: list[FrameTask], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, elsewhere: bool
+) -> None:
+    state = desk.do(*CHOSEN)
+    chosen = state.domain, state.settings, state.free, state.observed
+    export = intents.Export("masks", "All", shown_camera=True)
+    desk.do(intents.Calibrate(1), intents.OptimizeFrames("all"), export)
+    if elsewhere:
+        monkeypatch.setenv("CARTS_DATA", str(tmp_path / "other"))
+    desk = desk.reopened()
+    assert desk.state.choices != state.choices
+    assert [job for _, job in states(desk)] == ["failed", *["asked" if elsewhere else "waiting"] * 2]
+    if elsewhere:
+        # A job of this tab does not change what they use.
+        desk.do(intents.Export("csv", "All"), intents.AnswerJobs(True))
+    state = desk.finish()
+    assert used(tasks) == {chosen} and all(job.state is JobState.DONE for job in state.jobs[1:])
+    folders = [path for path in tmp_path.glob("sequence_exports/masks*/*") if path.is_dir()]
+    assert folders and not any("left" in path.name for path in folders), folders
+
+
+def test_a_job_that_is_started_again_uses_what_it_was_queued_with(desk: Desk, tasks: list[FrameTask]) -> None:
+    state = desk.do(*CHOSEN, intents.OptimizeFrames("all"))
+    while desk.state.jobs[0].done < 1:
+        desk.advance()
+    desk.do(intents.CancelJob(1), intents.SetSetting("iterations", 3), intents.SetObserved("network", "recording"))
+    desk.do(intents.ShowDomain("regular"), intents.RepeatJob(1))
+    desk.finish()
+    assert {task.index for task in tasks} == {0, 1, 2}
+    assert used(tasks) == {(state.domain, state.settings, state.free, state.observed)}
+
+
+def test_a_job_of_an_earlier_version_uses_the_defaults_whatever_ran_before(desk: Desk, tasks: list[FrameTask]) -> None:
+    row = {"number": 1, "kind": "optimize", "title": "", "options": {"frames": [0]}, "state": "waiting"}
+    project = desk.session.editor.project.path
+    project.with_name(f"{project.stem}_jobs.json").write_text(json.dumps([row]))
+    desk = desk.reopened()
+    state = desk.state
+    desk.do(*CHOSEN, intents.Export("csv", "All"), intents.AnswerJobs(True))
+    desk.finish()
+    assert used(tasks) == {(state.domain, state.settings, state.free, state.observed)}
+
+
+@pytest.mark.parametrize("name", ["domain", "camera"])
+def test_a_job_fails_when_the_recording_does_not_have_its_images(desk: Desk, name: str) -> None:
+    desk.do(intents.Calibrate(1), intents.Export("csv", "All"))
+    project = desk.session.editor.project.path
+    file = project.with_name(f"{project.stem}_jobs.json")
+    rows = json.loads(file.read_text())
+    rows[1]["choices"][name] = "elsewhere"
+    file.write_text(json.dumps(rows))
+    desk = desk.reopened()
+    assert states(desk)[1] == ("export", "asked")
+    desk.do(intents.AnswerJobs(True))
+    with pytest.raises(CartsError, match=f"Unknown {name} 'elsewhere'. This sequence has: "):
+        desk.finish()
+    assert states(desk)[1] == ("export", "failed")
+
+
 @pytest.mark.parametrize("edit", [intents.SetJoint("PSM1", 0, 0.1), intents.SetReview(ReviewState.ACCEPTED)])
 def test_a_frame_that_is_edited_while_it_is_optimized_stays_as_edited(desk: Desk, edit: intents.Intent) -> None:
     desk.do(intents.SetSetting("solver", "surface"), intents.OptimizeFrames("all"))
@@ -122,6 +209,10 @@ def job_list(folder: Path, *, kept: bool = True) -> JobList:
 
 
 EXPORT = {"format": "csv", "frames": "All"}
+CHOICES = Choices(
+    *("regular", "left", True, SolverName.SURFACE),
+    *(solver("surface"), FreeParameters(locked_joints=("PSM1/roll",)), Observed("both", "painted"), "backward"),
+)
 
 
 def test_after_the_viewer_was_killed_waiting_jobs_wait_and_the_one_that_ran_is_said_to_have_failed(
@@ -190,13 +281,52 @@ def test_options_of_a_job_are_clamped_as_in_the_page() -> None:
         assert read_options(kind, options, frames=3) == read
 
 
+def test_a_job_that_an_earlier_version_has_queued_here_waits(tmp_path: Path) -> None:
+    job = job_list(tmp_path).add("export", EXPORT)
+    file = tmp_path / "work_jobs.json"
+    (row,) = json.loads(file.read_text())
+    del row["choices"]
+    file.write_text(json.dumps([row]))
+    assert job.state is JobState.WAITING and job_list(tmp_path).jobs == (job,)
+
+
+@pytest.mark.parametrize("name", list(SolverName))
+def test_choices_are_read_as_they_were_written(tmp_path: Path, name: SolverName) -> None:
+    choices = replace(CHOICES, solver=name, settings=solver(name))
+    jobs = job_list(tmp_path)
+    jobs.add("export", EXPORT, choices)
+    (job,) = job_list(tmp_path).jobs
+    assert job == jobs.jobs[0] and job.choices == choices
+
+
 @pytest.mark.parametrize(
-    "change", [{}, {"options": {"minutes": 200, "folder": 1}}, {"kind": "calibrate"}, {"token": ""}]
+    ("change", "message"),
+    [
+        ({"domain": 1}, r"Expected `str`, got `int` - at `\$.domain`"),
+        ({"solver": "magic"}, "Invalid enum value 'magic'"),
+        ({"settings": {"iterations": 10**12}}, "iterations is 1000000000000; allowed: 1 to 10000"),
+        ({"settings": {"stages": [{"stage": ["Observe"]}]}}, r"has the stage \['Observe'\]"),
+        ({"free": {"arms": [1]}}, "Expected `str`"),
+        ({"observed": {"what": "stars"}}, "Invalid enum value 'stars'"),
+        ({"direction": "sideways"}, "Invalid enum value 'sideways'"),
+    ],
+)
+def test_wrong_choices_are_not_read(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_choices(to_plain(CHOICES) | change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({}, {"options": {"minutes": 200, "folder": 1}}, {"kind": "calibrate"}, {"token": ""}),
+        *({"choices": None}, {"choices": to_plain(replace(CHOICES, camera="right"))}),
+    ],
 )
 def test_only_jobs_that_this_user_has_queued_here_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict
 ) -> None:
-    job_list(tmp_path).add("adapt", {"minutes": 15, "folder": 1})
+    job_list(tmp_path).add("adapt", {"minutes": 15, "folder": 1}, CHOICES)
     file = tmp_path / "work_jobs.json"
     row = json.loads(file.read_text())[0] | change | {"title": "Harmless"}
     row["options"] |= {"frames": 20} if row["kind"] == "calibrate" else {}
