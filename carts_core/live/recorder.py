@@ -64,7 +64,6 @@ class Recorder:
 
     Attributes:
         missed: number of frames that were not recorded because the disk was too slow.
-        shortfall: sentence on these frames; empty if there are none.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -94,7 +93,7 @@ class Recorder:
 
     @property
     def shortfall(self) -> str:
-        """See the class."""
+        """Message about frames that were not recorded; empty if there are none."""
         return f"{counted(self.missed, 'frame')} not recorded, since the disk was too slow." if self.missed else ""
 
     def close(self) -> Path | None:

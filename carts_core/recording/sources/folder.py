@@ -146,15 +146,16 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
         return []
     files = tables_of(path)
     tables = [table for table in map(_readable, files) if table is not None]
-    chosen_in = [table for table in tables if set(options.columns.values()) <= table.columns.keys()]
-    if options.kinematics is not None or (options.columns and not chosen_in):
+    without, chosen = replace(options, columns={}), set(options.columns.values())
+    if options.kinematics is not None or (chosen and not any(chosen <= table.columns.keys() for table in tables)):
         table = kinematics_table(path, options)
         found = [] if table is None else [(table, guess_columns(table, options))]
     else:
-        without = replace(options, columns={})
-        having = set(map(id, chosen_in))
-        found = [(table, guess_columns(table, options if id(table) in having else without)) for table in tables]
-        unreadable = [file for file in files if file not in {table.path for table in tables} and _is_text(file)]
+        # Chosen columns apply to the tables that have all of them.
+        own = (options if chosen <= table.columns.keys() else without for table in tables)
+        found = [(table, guess_columns(table, each)) for table, each in zip(tables, own, strict=True)]
+        readable = {table.path for table in tables}
+        unreadable = [file for file in files if file not in readable and _is_text(file)]
         if not any(meanings.arms for _, meanings in found):
             for file in unreadable:
                 read_foreign_table(file)  # This raises its error.
