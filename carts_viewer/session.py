@@ -174,14 +174,13 @@ class Session:
         edits: dict[Key[Any], Any] = {}
         for row, arm in enumerate(self.scene.arms):
             key, values = Key.joints(frame.index, arm.name), state.joint_positions[row]
-            if not any(free.frees(arm.name, joint) for joint in arm.robot.joint_names):
-                pass
-            elif np.array_equal(values, before.joint_positions[row]):
-                edits[key] = saved.get(key)
-            elif np.array_equal(values, measured.joint_positions[row]):
-                edits[key] = None
-            else:
-                edits[key] = joint_correction(values, provenance, (joint_std or {}).get(arm.name))
+            if any(free.frees(arm.name, joint) for joint in arm.robot.joint_names):
+                if np.array_equal(values, before.joint_positions[row]):
+                    edits[key] = saved.get(key)
+                elif np.array_equal(values, measured.joint_positions[row]):
+                    edits[key] = None
+                else:
+                    edits[key] = joint_correction(values, provenance, (joint_std or {}).get(arm.name))
             if free.base_frames and not np.array_equal(state.T_world_base[row], before.T_world_base[row]):
                 edits[Key.base_frame(arm.name)] = _transform(state.T_world_base[row], provenance)
         for row, camera in enumerate(self.scene.cameras):
