@@ -5,7 +5,7 @@
   const PART = 512 * 1024; // bytes of a message; the server accepts 1 MiB
   const LISTED = 2000; // files in a message
   const SKIPPED = /(^|\/)(\.[^/]*|Thumbs\.db|desktop\.ini)(\/|$)/;
-  let running = false;
+  let running = null; // socket of the running upload
 
   const zone = () => document.querySelector(".carts-document [data-drop]");
 
@@ -23,7 +23,11 @@
       const said = JSON.parse(event.data);
       if (said.error) reject(new Error(said.error)); else resolve(said);
     };
-    socket.onclose = () => reject(new Error("The connection to the viewer was lost. Upload the files again."));
+  });
+
+  /** Rejects when the connection is closed. */
+  const closed = (socket) => new Promise((_, reject) => {
+    socket.onclose = ({ reason }) => reject(new Error(reason || "The connection to the viewer was lost. Upload the files again."));
   });
 
   async function transfer(socket, files) {
@@ -51,18 +55,17 @@
   /** Upload files, and open their folder. */
   async function upload(all) {
     const files = all.filter(({ path }) => !SKIPPED.test(path));
-    if (running) return;
+    if (running) { show(" An upload is running. Wait until it ends, or cancel it.", 0); return; }
     if (!files.length) { show("Nothing to upload: there are no visible files.", null, true); return; }
-    running = true;
-    const socket = new WebSocket(new URL("upload", location.href.replace(/^http/, "ws")));
+    const socket = running = new WebSocket(new URL("upload", location.href.replace(/^http/, "ws")));
     try {
       show(` ${files.length} files`, 0);
-      const folder = await transfer(socket, files);
+      const folder = await Promise.race([transfer(socket, files), closed(socket)]);
       window.carts.report("Chosen", { name: "open-path", value: folder });
     } catch (error) {
       show(error.message, null, true);
     } finally {
-      running = false;
+      running = null;
       socket.close();
     }
   }
@@ -90,7 +93,8 @@
 
   window.addEventListener("click", (event) => {
     const button = event.target instanceof Element ? event.target.closest("button[data-upload]") : null;
-    if (button) choose(button.dataset.upload === "folder");
+    if (button?.dataset.upload === "cancel") running?.close(1000, "Upload cancelled.");
+    else if (button) choose(button.dataset.upload === "folder");
   });
   for (const kind of ["dragover", "dragleave", "drop"]) {
     window.addEventListener(kind, (event) => {

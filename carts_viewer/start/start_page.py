@@ -244,8 +244,9 @@ class StartPage:
         self.show()
 
     def close(self) -> None:
-        """Accept no more uploads."""
+        """End the running upload, and accept no more uploads."""
         self._site.page.receive_upload = None
+        self._uploads.close()
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
         """Current entry of a project, the error if the project cannot be read, and the URL of the thumbnail."""

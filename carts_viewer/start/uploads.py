@@ -8,6 +8,7 @@ server answers each listing and each message with `{"received": BYTES}`, and end
 import asyncio
 import shutil
 from collections.abc import Generator, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -116,23 +117,28 @@ class Uploads:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._busy = False
+        self._running: ServerConnection | None = None
 
     async def serve(self, connection: ServerConnection) -> None:
         """Receive one upload; nothing is kept if the connection is lost."""
-        if self._busy:
+        if self._running is not None:
             return await _answer(connection, error="Another upload is running. Wait until it ends.")
-        self._busy = True
-        try:
-            folder = await self._receive(connection)
-        except ConnectionClosed:
-            return
-        except (CartsError, msgspec.DecodeError, OSError) as error:
-            await _answer(connection, error=str(error))
-        else:
-            await _answer(connection, folder=str(folder))
-        finally:
-            self._busy = False
+        self._running = connection
+        with suppress(ConnectionClosed):
+            try:
+                folder = await self._receive(connection)
+            except (CartsError, msgspec.DecodeError, OSError) as error:
+                await _answer(connection, error=str(error))
+            else:
+                await _answer(connection, folder=str(folder))
+            finally:
+                self._running = None
+
+    def close(self) -> None:
+        """Close the connection of the running upload. Thread-safe."""
+        if (running := self._running) is not None:
+            why = "The start page was closed, which ended the upload. Upload the files again."
+            asyncio.run_coroutine_threadsafe(running.close(reason=why), running.loop)
 
     async def _receive(self, connection: ServerConnection) -> Path:
         files: list[tuple[str, int]] = []

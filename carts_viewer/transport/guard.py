@@ -305,8 +305,8 @@ def gated(
     Args:
         respond: Returns the response to a request; None to let the server respond.
         refuse: Returns the reason to drop a message; None to accept it.
-        handler_of: Returns the handler of connections to a path, which checks its messages itself; None for the
-            server's handler.
+        handler_of: Returns the handler of connections to a path, which checks its messages itself and depends on
+            nothing else; None for the server's handler.
     """
     original = websockets.asyncio.server.serve
 

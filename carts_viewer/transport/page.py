@@ -285,7 +285,7 @@ class Page:
         self.thumbnail: Callable[[str], Awaitable[Response]] | None = None
         """Answers requests below `/thumbnail/`; None if no recording is shown."""
         self.receive_upload: Callable[[ServerConnection], Awaitable[None]] | None = None
-        """Receives the connections to `UPLOAD`; None if there are no uploads."""
+        """Receives the connections to `UPLOAD`; None if there are no uploads, and connections are closed."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         list_icons_once()
@@ -293,7 +293,7 @@ class Page:
             gated(
                 self._respond,
                 lambda data: refusal(data, self._value_of),
-                lambda path: self.receive_upload if self._guard.proxy.inside(path) == UPLOAD else None,
+                lambda path: self._receive_upload if self._guard.proxy.inside(path) == UPLOAD else None,
             ),
             contextlib.redirect_stdout(io.StringIO()),
         ):
@@ -408,6 +408,10 @@ class Page:
         cookie = self._guard.cookie(request.path, request.headers)
         more = {"Content_Security_Policy": policy} | ({} if cookie is None else {"Set_Cookie": cookie})
         return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(nonce), **more)
+
+    async def _receive_upload(self, connection: ServerConnection) -> None:
+        if self.receive_upload is not None:
+            await self.receive_upload(connection)
 
     def _value_of(self, element: str) -> Any:
         # A tab may connect before the server's constructor has returned.

@@ -2,6 +2,7 @@
 
 import json
 import os
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, FloatRect, Page, expect
 from viewer_tab import box_of, new_context
 from waiting import eventually
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosedOK, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
@@ -104,6 +105,18 @@ def test_only_the_start_page_accepts_uploads_of_its_own_origin(tmp_path: Path) -
         # A lost connection leaves nothing.
         offered(site.url, listing)
         eventually(lambda: [entry.name for entry in root.iterdir()] == ["a"])
+        # Another page ends the upload.
+        with connect(f"{site.url.replace('http', 'ws')}/upload", compression=None) as connection:
+            connection.send(listing)
+            assert json.loads(connection.recv(30)) == {"received": 0}
+            site.post(site.show_recording)
+            site.wait()
+            with pytest.raises(ConnectionClosedOK):
+                connection.send(b"12")
+                connection.recv(5)
+        eventually(lambda: [entry.name for entry in root.iterdir()] == ["a"])
+        with pytest.raises(ConnectionClosedOK):
+            offered(site.url, listing)
 
 
 def drop(page: Page, path: Path, box: FloatRect) -> None:
@@ -135,6 +148,34 @@ def test_a_chosen_or_dropped_folder_becomes_a_new_recording(tmp_path: Path, brow
             chooser.value.set_files(source)
         expect(page.get_by_role("heading", name="day 3")).to_be_visible(timeout=60_000)
         assert content_of(root) == {"day 3/left/001.png": (source / "left" / "001.png").read_bytes()}
+
+
+@pytest.mark.browser
+def test_an_upload_is_cancelled_and_another_can_follow(
+    tmp_path: Path, browser: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, source, goes_on = tmp_path / "labs", tmp_path / "day 3", threading.Event()
+    root.mkdir()
+    source.mkdir()
+    (source / "001.png").write_bytes(os.urandom(2_000_000))
+    step = uploads._step
+    monkeypatch.setattr(uploads, "_step", lambda *given: step(*given) if given[1] is None or goes_on.wait(30) else None)
+    with Site([root], port=0) as site, closing(new_context(browser)) as context:
+        page = context.new_page()
+        page.goto(site.url)
+        box = box_of(page.get_by_role("button", name="Choose a folder"))
+        drop(page, source, box)
+        cancel = page.get_by_role("button", name="Cancel")
+        expect(cancel).to_be_visible(timeout=60_000)
+        drop(page, source, box)
+        expect(page.locator(".target output")).to_contain_text("An upload is running")
+        cancel.click()
+        expect(page.locator(".target output")).to_contain_text("Upload cancelled")
+        expect(cancel).to_be_hidden()
+        goes_on.set()
+        eventually(lambda: list(root.iterdir()) == [])
+        drop(page, source, box)
+        expect(page.get_by_role("heading", name="day 3")).to_be_visible(timeout=60_000)
 
 
 @pytest.mark.browser
