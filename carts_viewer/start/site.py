@@ -212,11 +212,14 @@ class Site:
                 page.choose(event.name, event.value)
             else:
                 page.click(*event.at)
-        except CartsError as error:
-            page.fail(error)
         except Exception as error:
-            _log.exception("Unexpected error in the page")
-            page.fail(error)
+            if not isinstance(error, CartsError):
+                _log.exception("Unexpected error in the page")
+            if self.shown is page:
+                page.fail(error)
+            else:
+                # Another page was being made.
+                self.show_start(str(error) or type(error).__name__)
 
     def _leave(self) -> None:
         page, self.shown = self.shown, None

@@ -151,6 +151,21 @@ def test_a_sequence_that_cannot_be_opened_leads_back_with_the_reason(site: Site,
         assert "bad.toml" in site.document.content and 'role="alert"' in site.document.content
 
 
+def test_the_start_page_works_after_a_page_that_cannot_be_made(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with site:
+        site.wait()
+        monkeypatch.setenv("CARTS_DATA", str(tmp_path / "file" / "data"))
+        site.post(lambda: site._dispatch(Chosen("open-path", str(tmp_path / "labs"))))
+        site.wait()
+        assert isinstance(site.shown, StartPage) and 'role="alert"' in site.document.content
+        site.post(lambda: site._dispatch(Chosen("open", "")))
+        site.wait()
+        assert 'aria-label="File browser"' in site.document.content
+
+
 def test_only_a_listed_recent_sequence_is_opened_by_its_card(site: Site, tiny_sequence: Callable[..., Path]) -> None:
     path = tiny_sequence(frames=2)
     with site:
