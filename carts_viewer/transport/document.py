@@ -59,7 +59,8 @@ def escaped(value: Any) -> str:
 
 
 def render(template: str, **values: Any) -> str:
-    """HTML of a template in `carts_viewer/templates/`; values are escaped as by `escaped`."""
+    """HTML of a template in `carts_viewer/templates/`; values are escaped as by `escaped`, those with the filter
+    `payload` for HTML only."""
     return _templates().get_template(template).render(values)
 
 
@@ -67,7 +68,7 @@ def render(template: str, **values: Any) -> str:
 def _templates() -> "jinja2.Environment":
     # Not needed by the viewer of one sequence.
     import jinja2  # noqa: PLC0415
-    from markupsafe import Markup  # noqa: PLC0415
+    from markupsafe import Markup, escape  # noqa: PLC0415
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent.parent / "templates")
     environment = jinja2.Environment(
@@ -78,5 +79,7 @@ def _templates() -> "jinja2.Environment":
         undefined=jinja2.StrictUndefined,
         finalize=lambda value: value if hasattr(value, "__html__") else visible(str(value)),
     )
+    # Lone surrogates, of names that are not UTF-8, cannot be reported.
+    environment.filters["payload"] = lambda value: escape(str(value).encode("utf-8", "backslashreplace").decode())
     environment.globals["icon"] = lambda name: Markup(icon(name).replace("<svg ", '<svg aria-hidden="true" ', 1))
     return environment

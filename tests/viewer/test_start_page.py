@@ -1,5 +1,6 @@
 """The start page and a batch: allowed folders, recent recordings, half-made imports, and jobs that were done."""
 
+import html
 import json
 import os
 import re
@@ -230,6 +231,21 @@ def test_an_import_that_was_begun_is_gone_on_with_by_another_server(site: Site, 
         again.post(lambda: resumed.choose("delete", ""))
         again.wait()
         assert drafts() == [] and isinstance(again.shown, StartPage)
+
+
+def test_a_folder_whose_name_has_a_format_character_can_be_chosen(tmp_path: Path) -> None:
+    folder = tmp_path / "labs" / "می\u200cخ & co"
+    folder.mkdir(parents=True)
+    with Site([tmp_path / "labs"], port=0) as site:
+        site.post(lambda: site._dispatch(Chosen("open-batch", "")))
+        site.wait()
+        # Shown names have visible characters only.
+        assert "می\\u200cخ &amp; co/" in site.document.content
+        (value,) = re.findall('data-do="browse" data-value="([^"]*می[^"]*)"', site.document.content)
+        assert html.unescape(value) == str(folder)
+        site.post(lambda: site._dispatch(Chosen("browse", html.unescape(value))))
+        site.wait()
+        assert 'role="alert"' not in site.document.content and "This folder is empty." in site.document.content
 
 
 def test_what_is_foreign_is_escaped_in_documents() -> None:
