@@ -366,8 +366,7 @@ class ImportingHandler(Handler):
         given = intent.path.strip()[:_MAX_PATH_LENGTH]
         if not given:
             raise CartsError("Enter the path of the masks: an annotation file, or a folder of masks or labels.")
-        # The folder is resolved, since it may be reached through a link.
-        path = session.roots.checked(session.sequence.path.parent.resolve() / Path(given))
+        path = session.roots.checked(session.sequence.path.parent.absolute() / os.path.expanduser(given))
         from carts_core.recording.annotations import read_annotations  # noqa: PLC0415  imports all importers
 
         found = read_annotations(path, session.sequence, intent.camera, format=intent.format, confined=True)

@@ -38,7 +38,12 @@ class Entry:
 
 
 class Roots:
-    """Allowed folders; links are not followed, so nothing outside can be reached."""
+    """Allowed folders; links are not followed, so nothing outside can be reached.
+
+    Attributes:
+        folders: the folders, resolved, in the order of `--root`.
+        given: the absolute paths by which the folders were given, which may contain links; deepest first.
+    """
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """
@@ -52,18 +57,23 @@ class Roots:
             if not folder.is_dir():
                 raise SettingsError(f"--root {folder} is not a folder. Give folders that contain recordings.")
         # An allowed folder may itself be a link; links below it are not followed.
+        self.given = tuple(sorted((folder.absolute() for folder in folders), key=lambda each: -len(each.parts)))
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 
     def checked(self, text: str | Path) -> Path:
-        """Check an absolute path below one of the folders.
+        """Check an absolute path below one of the folders; returns it below the resolved folder.
 
         Raises:
-            SettingsError: the path is outside of the folders, does not exist, contains a link or a hidden name, or is
-                neither a folder nor a file.
+            SettingsError: the path is relative or outside of the folders, does not exist, contains a link or a hidden
+                name, or is neither a folder nor a file.
         """
         path = Path(text)
+        if not path.is_absolute():
+            raise SettingsError(f"{str(text)!r} is not an absolute path. Give a path such as {self.folders[0]}/NAME.")
+        given = next((given for given in self.given if path.is_relative_to(given)), None)
+        path = path if given is None else given.resolve() / path.relative_to(given)
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
-        if "\x00" in str(text) or not path.is_absolute() or ".." in path.parts or root is None:
+        if "\x00" in str(text) or ".." in path.parts or root is None:
             raise SettingsError(
                 f"{text} is outside of the allowed folders. Restart carts view with --root FOLDER to allow it."
             )

@@ -163,7 +163,7 @@ class Site:
                 project=project,
                 report=self._report,
                 page=self.page,
-                folders=self.roots.folders,
+                folders=self.roots.given,
                 solver=self._solver,
                 **self._options,
             )

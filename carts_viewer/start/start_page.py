@@ -1,6 +1,7 @@
 """The start page: recent recordings, unfinished imports, the sample, and a file browser."""
 
 import json
+import os
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
@@ -211,7 +212,7 @@ class StartPage:
             case "forget":
                 forget(value)
             case "open-path":
-                return self._open(self._site.roots.checked(Path(value.strip()).expanduser()))
+                return self._open(self._site.roots.checked(os.path.expanduser(value.strip())))
             case "open":
                 self._toggle("Choose a sequence file (.toml).", lambda entry: entry.path.suffix.lower() == ".toml")
             case "open-batch":

@@ -314,8 +314,10 @@ def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[...,
     elsewhere = tmp_path.parent / f"{tmp_path.name}_elsewhere"
     elsewhere.mkdir()
     assert cv2.imwrite(str(elsewhere / "001.png"), np.full((72, 96), 255, np.uint8))
-    with ViewerApp.open(folder / path.name, port=0, folders=(elsewhere,)) as app:
-        app.queue.put(intents.ImportMasks(str(elsewhere)))
+    link = tmp_path / "link"
+    link.symlink_to(elsewhere)
+    with ViewerApp.open(folder / path.name, port=0, folders=(link,)) as app:
+        app.queue.put(intents.ImportMasks(str(link)))
         assert "Imported 1 mask" in app.wait_until_shown().imported
 
 

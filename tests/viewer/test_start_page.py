@@ -67,6 +67,18 @@ def test_nothing_outside_of_the_roots_can_be_reached(roots: Roots) -> None:
             roots.checked(path)
 
 
+def test_a_folder_given_by_a_link_is_reached_by_the_path_of_the_link(roots: Roots, tmp_path: Path) -> None:
+    real, link = roots.folders[0], tmp_path / "link"
+    link.symlink_to(real)
+    linked = Roots([tmp_path, link])
+    assert linked.checked(link / "inner") == linked.checked(real / "inner") == real / "inner"
+    for path in (link / "out", link / "inner" / "s.toml", link / ".." / "secret"):
+        with pytest.raises(SettingsError):
+            linked.checked(path)
+    with pytest.raises(SettingsError, match="not an absolute path"):
+        linked.checked("inner")
+
+
 def test_a_root_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"--root .*nothing is not a folder"):
         Roots([tmp_path / "nothing"])
