@@ -126,7 +126,7 @@ class FileBrowser:
     def entries(self) -> list[Entry]:
         """Entries of the folder; none, with a `problem`, if it cannot be read."""
         try:
-            return [] if self.folder is None else self.roots.entries(self.folder)
+            return [] if self.folder is None else self.roots.entries(self.folder, self.wanted)
         except SettingsError as error:
             self.problem = str(error)
             return []

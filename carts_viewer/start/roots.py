@@ -3,7 +3,7 @@
 import os
 import stat
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,20 +20,20 @@ class Entry:
     name: str
     path: Path
     is_folder: bool
-    size: int
-    """Size [bytes]."""
-    changed: float
-    """Modification time [s since 1970]."""
 
     @property
     def about(self) -> str:
-        """Size and modification date, as text."""
-        size, unit = float(self.size), "B"
+        """Size and modification date, as text; empty if they cannot be read."""
+        try:
+            known = os.lstat(self.path)
+        except OSError:
+            return ""
+        size, unit = float(known.st_size), "B"
         for unit in ("B", "KB", "MB", "GB"):
             if size < 1000 or unit == "GB":
                 break
             size /= 1000
-        day = time.strftime("%Y-%m-%d", time.localtime(self.changed))
+        day = time.strftime("%Y-%m-%d", time.localtime(known.st_mtime))
         return f"{size:.{0 if unit in ('B', 'KB') else 1}f} {unit} · {day}"
 
 
@@ -94,26 +94,31 @@ class Roots:
             raise SettingsError(f"{step} cannot be opened ({error.strerror}). Choose another path.") from error
         return path
 
-    def entries(self, folder: Path) -> list[Entry]:
+    def entries(self, folder: Path, wanted: Callable[[Entry], bool] = lambda _: True) -> list[Entry]:
         """Folders and then files, sorted by name, without hidden entries and links.
+
+        Of more than `MAX_ENTRIES`, folders and wanted files are kept first.
 
         Raises:
             SettingsError: the folder is not allowed, or not readable.
         """
+
+        def order(entry: Entry) -> tuple[bool, str]:
+            return not entry.is_folder, entry.name.casefold()
+
         found = []
         try:
             with os.scandir(self.checked(folder)) as listing:
                 for each in listing:
-                    if each.name.startswith(".") or each.is_symlink() or len(found) >= MAX_ENTRIES:
+                    if each.name.startswith("."):
                         continue
                     is_folder = each.is_dir(follow_symlinks=False)
                     if is_folder or each.is_file(follow_symlinks=False):
-                        known = each.stat(follow_symlinks=False)
-                        path = Path(folder) / each.name
-                        found.append(Entry(each.name, path, is_folder, known.st_size, known.st_mtime))
+                        found.append(Entry(each.name, Path(folder) / each.name, is_folder))
         except OSError as error:
             raise SettingsError(f"{folder} cannot be opened ({error.strerror}). Choose another path.") from error
-        return sorted(found, key=lambda entry: (not entry.is_folder, entry.name.casefold()))
+        found.sort(key=lambda entry: (not (entry.is_folder or wanted(entry)), *order(entry)))
+        return sorted(found[:MAX_ENTRIES], key=order)
 
     def parent(self, folder: Path) -> Path | None:
         """The folder above; None for an allowed folder itself."""

@@ -5,8 +5,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,7 +27,7 @@ from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.settings.interchange import ImportOptions
 from carts_viewer.actions import intents
-from carts_viewer.start.roots import Roots
+from carts_viewer.start.roots import MAX_ENTRIES, Roots
 from carts_viewer.start.site import Site
 from carts_viewer.start.start_page import StartPage, recent_projects, thumbnail
 from carts_viewer.transport.document import escaped, render
@@ -77,6 +77,24 @@ def test_a_folder_given_by_a_link_is_reached_by_the_path_of_the_link(roots: Root
             linked.checked(path)
     with pytest.raises(SettingsError, match="not an absolute path"):
         linked.checked("inner")
+
+
+def test_a_long_list_keeps_folders_and_wanted_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "z").mkdir()
+    for name in ("z.csv", *(f"{number:04d}.png" for number in range(MAX_ENTRIES + 100))):
+        (tmp_path / name).touch()
+    scanned = os.scandir
+
+    @contextmanager
+    def images_first(path: Path) -> Iterator[list[os.DirEntry[str]]]:
+        with scanned(path) as listing:
+            yield sorted(listing, key=lambda each: each.name)
+
+    monkeypatch.setattr(os, "scandir", images_first)
+    listed = Roots([tmp_path]).entries(tmp_path, lambda entry: entry.path.suffix == ".csv")
+    names = [entry.name for entry in listed]
+    assert len(names) == MAX_ENTRIES and (names[:2], names[-1]) == (["z", "0000.png"], "z.csv")
+    assert listed[-1].about.startswith("0 B")
 
 
 def test_a_root_that_is_not_there_is_refused(tmp_path: Path) -> None:
