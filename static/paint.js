@@ -11,6 +11,7 @@
   const FORGOTTEN = 60000; // [ms] after which an unacknowledged stroke is dropped
 
   let brush = { tool: "select" }; // state of the tool from the server
+  let picture = {}; // frame, camera and image size [px] of the shown picture
   let canvas = null;
   let drawing = null; // the current stroke, or the open polygon
   let pending = []; // sent strokes that no overlay shows yet
@@ -28,19 +29,20 @@
     if (!image) return null;
     const box = canvas.getBoundingClientRect();
     return [
-      ((event.clientX - box.left - image.left) / image.width) * brush.width,
-      ((event.clientY - box.top - image.top) / image.height) * brush.height,
+      ((event.clientX - box.left - image.left) / image.width) * picture.width,
+      ((event.clientY - box.top - image.top) / image.height) * picture.height,
     ];
   }
 
   /** Distance on the screen between two points of the image [px]. */
   function apart(a, b) {
     const image = place();
-    return Math.hypot(((a[0] - b[0]) * image.width) / brush.width, ((a[1] - b[1]) * image.height) / brush.height);
+    return Math.hypot(((a[0] - b[0]) * image.width) / picture.width, ((a[1] - b[1]) * image.height) / picture.height);
   }
 
   function begin(point) {
-    const { frame, camera, target, label, diameter, tool, colors } = brush;
+    const { frame, camera } = picture;
+    const { target, label, diameter, tool, colors } = brush;
     drawing = {
       frame, camera, target, label, diameter, polygon: tool === "polygon", prompt: tool === "prompt",
       erase: (tool === "eraser") !== shift,
@@ -85,6 +87,12 @@
   function drop() {
     drawing = null;
     dirty = true;
+  }
+
+  /** End the stroke, which belongs to the frame and tool with which it was started; an unfinished polygon is dropped. */
+  function stop() {
+    if (drawing?.polygon) drop();
+    else finish();
   }
 
   // ---- Pointer and keys --------------------------------------------------------------------------------------------
@@ -161,7 +169,7 @@
   }
 
   function path(context, stroke, image, closed) {
-    const [x, y] = [image.width / brush.width, image.height / brush.height];
+    const [x, y] = [image.width / picture.width, image.height / picture.height];
     context.beginPath();
     // A single point is repeated, so that the round ends of the line draw it.
     const points = stroke.points.length === 1 ? [...stroke.points, ...stroke.points] : stroke.points;
@@ -191,12 +199,12 @@
     context.lineWidth = 1.5;
     context.stroke();
     const [u, v] = stroke.points[0];
-    ring(context, u * scale, (v * image.height) / brush.height, 4);
+    ring(context, u * scale, (v * image.height) / picture.height, 4);
   }
 
   /** Draw a prompt: a dot, or a box. */
   function paintPrompt(context, stroke, image) {
-    const [x, y] = [image.width / brush.width, image.height / brush.height];
+    const [x, y] = [image.width / picture.width, image.height / picture.height];
     const [first, last] = [stroke.points[0], stroke.points[stroke.points.length - 1]];
     context.globalAlpha = 1;
     if (stroke.points.length === 1) {
@@ -233,14 +241,14 @@
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
-    if (!image || !brush.width) return;
+    if (!image || !picture.width) return;
     context.translate(image.left, image.top);
     context.save();
     context.beginPath();
     context.rect(0, 0, image.width, image.height);
     context.clip();
     for (const stroke of pending) {
-      if (stroke.frame === brush.frame && stroke.camera === brush.camera) paint(context, stroke, image, true);
+      if (stroke.frame === picture.frame && stroke.camera === picture.camera) paint(context, stroke, image, true);
     }
     if (drawing) {
       const towards = drawing.polygon && pointer ? [...drawing.points, pointer] : drawing.points;
@@ -248,8 +256,8 @@
     }
     context.restore();
     if (pointer && active() && !["polygon", "prompt"].includes(brush.tool)) {
-      const scale = image.width / brush.width;
-      ring(context, pointer[0] * scale, (pointer[1] * image.height) / brush.height, (brush.diameter / 2) * scale);
+      const scale = image.width / picture.width;
+      ring(context, pointer[0] * scale, (pointer[1] * image.height) / picture.height, (brush.diameter / 2) * scale);
     }
   }
 
@@ -282,14 +290,15 @@
   window.addEventListener("keydown", onKey, { capture: true });
   window.addEventListener("keyup", onKey, { capture: true });
   Object.assign(window.carts, {
-    /** Set the selected tool, and the frame under it. */
+    /** Set the frame and camera of the picture, and the size of its image [px]; it comes with the picture. */
+    setPicture(frame, camera, width, height) {
+      stop();
+      picture = { frame, camera, width, height };
+      dirty = true;
+    },
+    /** Set the selected tool. */
     setBrush(message) {
-      const other = message.frame !== brush.frame || message.camera !== brush.camera;
-      if (drawing && (other || message.tool !== brush.tool)) {
-        // A stroke belongs to the frame on which it was started; an unfinished polygon is dropped.
-        if (drawing.polygon) drop();
-        else finish();
-      }
+      if (message.tool !== brush.tool) stop();
       brush = message;
       dirty = true;
       if (canvas) takePointer(active());

@@ -17,7 +17,7 @@ class ToolPalette:
     """Sends the selected tool, its options and the numbers of painted pixels to the page when they have changed."""
 
     def __init__(self, page: TabPage, session: Session) -> None:
-        self._page, self._scene = page, session.scene
+        self._page = page
         self._classes = [(one.number, one.name) for one in part_classes(session.scene.arms)]
         self._keypoints = list(labelled_keypoints(session.scene))
         self._sent: dict[str, Any] = {}
@@ -30,7 +30,7 @@ class ToolPalette:
             self._page.call("setBrush", message)
 
     def _message(self, state: ViewState) -> dict[str, Any]:
-        camera, brush, keypoints = self._scene.camera(state.camera), state.brush, state.keypoints
+        brush, keypoints = state.brush, state.keypoints
         add, erase = (ADDED_COLOR, REMOVED_COLOR) if brush.target is Target.MASK else (IGNORED_COLOR, (255, 255, 255))
         label = brush.label if brush.target is Target.MASK else 0
         residuals = keypoints.residuals
@@ -40,10 +40,6 @@ class ToolPalette:
             "target": brush.target,
             "diameter": brush.diameter,
             "loupe": state.loupe,
-            "frame": state.index,
-            "camera": camera.name,
-            "width": camera.width,
-            "height": camera.height,
             "colors": {"add": f"rgb{label_color(label) if label else add}", "erase": f"rgb{erase}"},
             "classes": self._classes,
             "painted": _counts(state) if brush.tool.paints else [],

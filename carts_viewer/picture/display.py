@@ -71,6 +71,8 @@ class PageDisplay:
             self._rate_limit.sent()
             # Sent together, so that a new frame never appears under the old frame's overlay.
             with self._page.atomic():
+                if old is None or (state.index, state.camera) != (old.index, old.camera):
+                    self._page.call("setPicture", state.index, state.camera, camera.width, camera.height)
                 if new_frame:
                     self._scene_view.show_frame(state.frame.images[state.camera], camera)
                 self._scene_view.show_overlay(overlays[state.camera], camera)

@@ -1,7 +1,11 @@
 """Pictures over the frame, when they are sent, the timeline's curves and thumbnails, and the table of keys."""
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +19,10 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.shortcuts import checked_keys, key_table, shortcuts, with_keys
 from carts_viewer.app import ViewerApp
 from carts_viewer.panels.timeline import THUMBNAIL_HEIGHT, Traces, frame_code
+from carts_viewer.panels.tools import ToolPalette
 from carts_viewer.picture import layers
-from carts_viewer.picture.display import MAX_WAIT, RateLimit
+from carts_viewer.picture.display import MAX_WAIT, PageDisplay, RateLimit
+from carts_viewer.picture.strokes import Tool
 
 
 @pytest.fixture
@@ -84,6 +90,44 @@ def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -
     now[0] += 0.02
     limit.drawn()
     assert limit.ready_in() == 0.0
+
+
+class Sent:
+    """Page and scene of a tab that record in order what is sent to them."""
+
+    def __init__(self) -> None:
+        self.client = SimpleNamespace(client_id=1)
+        self.log: list[Any] = []
+
+    def call(self, *message: Any) -> None:
+        self.log.append(message)
+
+    @contextmanager
+    def atomic(self) -> Iterator[None]:
+        self.log.append("begin")
+        yield
+        self.log.append("end")
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *arguments: self.log.append(name)
+
+
+def test_the_frame_of_strokes_changes_with_the_picture_and_not_with_the_widgets(desk: Desk) -> None:
+    sent: Any = Sent()
+    display = PageDisplay(sent, desk.session, desk.renderer, sent, [ToolPalette(sent, desk.session)])
+    display.show_picture(desk.state)
+    assert ("setPicture", 0, "left", 96, 72) in sent.log
+    desk.do(intents.SetTool(Tool.BRUSH), intents.ShowFrame(1))
+    assert display.ready_in() > 0.0
+    sent.log.clear()
+    display.show_panels(desk.state)
+    ((name, brush),) = sent.log
+    assert name == "setBrush" and not {"frame", "camera"} & set(brush)
+    display.show_picture(desk.state)
+    assert sent.log[1:4] == ["begin", ("setPicture", 1, "left", 96, 72), "show_frame"]
+    sent.log.clear()
+    display.show_picture(desk.do(intents.SetOpacity(0.7)))
+    assert "show_overlay" in sent.log and "setPicture" not in [each[0] for each in sent.log]
 
 
 # ---- The timeline ---------------------------------------------------------------------------------------------------
