@@ -169,8 +169,13 @@ class Controller(Handler):
         Raises:
             CartsError: the intent cannot be carried out; the state stays valid.
         """
-        if self._live.replaces(intent):
-            return
+        try:
+            if self._live.replaces(intent):
+                return
+        except CartsError:
+            if isinstance(intent, intents.Paint):
+                self._painting.answer(intent)
+            raise
         if self._job_runner.takes(intent):
             self._forward(intent)
             return

@@ -66,7 +66,7 @@ class PaintingHandler(Handler):
                     self._change(self._step(stroke), edits)
             finally:
                 if self._reply is None:
-                    self._painted(self._prompts.popleft())
+                    self.answer(self._prompts.popleft())
 
     def _on_NextObject(self, intent: intents.NextObject) -> None:
         self._prompting.finish()
@@ -111,10 +111,10 @@ class PaintingHandler(Handler):
             covered = stroke.covers(self._session.scene.camera(stroke.camera))
             self._change(self._step(stroke), self._changed(stroke)(self._layers(stroke), covered, stroke.erase))
         finally:
-            self._painted(intent)
+            self.answer(intent)
 
-    def _painted(self, intent: intents.Paint) -> None:
-        """Report to the page that a stroke is applied."""
+    def answer(self, intent: intents.Paint) -> None:
+        """Report to the page that a stroke is applied or refused."""
         self._set_brush(painted={**self._context.state.brush.painted, intent.client_id: intent.stroke.number})
 
     def _on_ClearLayer(self, intent: intents.ClearLayer) -> None:

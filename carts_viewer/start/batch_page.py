@@ -23,7 +23,7 @@ from carts_core.files import output_path
 from carts_core.files.reading import IMAGE, read_bytes
 from carts_core.package_imports import gc_paused
 from carts_core.recording import Sequence
-from carts_viewer.start.host import Host
+from carts_viewer.start.host import Host, SitePage
 from carts_viewer.transport.document import render
 
 _UPDATE_INTERVAL, _IDLE_INTERVAL = 5.0, 15.0
@@ -39,7 +39,7 @@ _SEPARATOR = "\n"
 """Separator of job and frame in the value of a button; names do not contain it."""
 
 
-class BatchPage:
+class BatchPage(SitePage):
     """Table of jobs and pictures of the worst frames, which can be opened for review."""
 
     def __init__(self, site: Host, folder: Path) -> None:
@@ -105,9 +105,6 @@ class BatchPage:
                 )
                 return self._render()
         self.show()
-
-    def click(self, u: float, v: float) -> None:
-        """Do nothing, since no image is shown."""
 
     def fail(self, error: Exception) -> None:
         """Show an error."""

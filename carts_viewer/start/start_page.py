@@ -22,7 +22,7 @@ from carts_core.project.identity import data_dir
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.companions import set_aside_damaged
 from carts_viewer.picture.layers import small_jpeg
-from carts_viewer.start.host import FileBrowser, Host, Wanted
+from carts_viewer.start.host import FileBrowser, Host, SitePage, Wanted
 from carts_viewer.start.uploads import Uploads
 from carts_viewer.transport.document import render
 
@@ -164,13 +164,15 @@ def _list() -> Path:
     return _folder() / "recent.json"
 
 
-class StartPage:
+class StartPage(SitePage):
     """Cards of recent recordings, unfinished imports, the sample, and a file browser."""
 
     def __init__(self, site: Host, problem: str = "") -> None:
         self._site = site
         self._problem = problem or set_damaged_aside()
         self._browser: FileBrowser | None = None
+        self._path = ""
+        """The newest typed path."""
         self._uploads = Uploads(site.roots.folders[0])
         site.page.receive_upload = self._uploads.serve
 
@@ -183,6 +185,7 @@ class StartPage:
             "start.html",
             problem=self._problem,
             browser=self._browser,
+            path=self._path,
             drafts=drafts(),
             cards=[self._card(project) for project in recent_projects()],
             root=self._site.roots.folders[0],
@@ -212,6 +215,7 @@ class StartPage:
             case "forget":
                 forget(value)
             case "open-path":
+                self._path = value
                 return self._open(self._site.roots.checked(os.path.expanduser(value.strip())))
             case "open":
                 self._toggle("Choose a sequence file (.toml).", lambda entry: entry.path.suffix.lower() == ".toml")
@@ -236,9 +240,6 @@ class StartPage:
         new = FileBrowser(self._site.roots, wanted=wanted, folders=folders, purpose=purpose)
         self._browser = None if self._browser is not None else new
 
-    def click(self, u: float, v: float) -> None:
-        """Do nothing, since no image is shown."""
-
     def fail(self, error: Exception) -> None:
         """Show an error."""
         self._problem = str(error) or type(error).__name__
@@ -251,15 +252,12 @@ class StartPage:
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
         """Current entry of a project, the error if the project cannot be read, and the URL of the thumbnail."""
-        picture = self._published(thumbnail(project))
+        jpeg = thumbnail(project)
+        picture = "" if jpeg is None else self._site.page.media.publish(jpeg)
         try:
             return up_to_date(project), "", picture
         except CartsError as error:
             return project, str(error), picture
-
-    def _published(self, jpeg: bytes | None) -> str:
-        """URL of a picture; empty if there is none."""
-        return "" if jpeg is None else self._site.page.media.publish(jpeg)
 
 
 def _ago(seconds: float) -> str:

@@ -19,6 +19,7 @@ from carts_core.optimization import FrameOptimizer
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
 from carts_core.segmentation import Prompt
 from carts_viewer.actions import intents
+from carts_viewer.actions.live import LiveHandler
 from carts_viewer.picture.layers import (
     ADDED_COLOR,
     IGNORED_COLOR,
@@ -166,6 +167,13 @@ def test_each_stroke_is_saved_at_once_as_one_step_that_undo_takes_back(desk: Des
     # A stroke that changes nothing is no step, but it is answered.
     desk.do(_polygon(Target.IGNORE, erase=True, number=4))
     assert not desk.saved.position and desk.state.brush.painted == {7: 4}
+
+
+def test_a_stroke_during_a_stream_is_refused_and_answered(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LiveHandler, "active", True)
+    with pytest.raises(CartsError, match="cannot be edited"):
+        desk.do(_polygon(Target.MASK, number=5))
+    assert not desk.saved.steps and desk.state.brush.painted == {7: 5}
 
 
 def test_a_stroke_stays_with_the_frame_and_camera_that_it_was_drawn_over(desk: Desk) -> None:
