@@ -10,7 +10,7 @@ from carts_core.errors import CartsError
 from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import BrowsingHandler
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.actions.import_export import Deliver, ExportingHandler, ImportingHandler, shown_mask
+from carts_viewer.actions.import_export import Deliver, ExportingHandler, TransferHandler, shown_mask
 from carts_viewer.actions.jobs import JobRequester, JobsHandler
 from carts_viewer.actions.live import LiveHandler
 from carts_viewer.actions.optimizing import OptimizingHandler
@@ -35,11 +35,10 @@ class JobRunner:
         session: Session,
         renderer: OverlayRenderer,
         optimizers: OptimizerFactory,
-        deliver: Deliver,
     ) -> None:
         self._context = context = Context(state, session, renderer)
         self._propagating = PropagatingHandler(context, optimizers)
-        self._exporting = ExportingHandler(context, optimizers, deliver)
+        self._exporting = ExportingHandler(context, optimizers)
         self._jobs = JobsHandler(context, optimizers, self._propagating, self._exporting)
 
     @property
@@ -142,6 +141,7 @@ class Controller(Handler):
         self._browsing = BrowsingHandler(context)
         self._live = LiveHandler(context, optimizers, self._browsing.show)
         self._painting = PaintingHandler(context, optimizers.segment)
+        self._transfers = TransferHandler(context, deliver)
         self._annotating = AnnotatingHandler(context, self._browsing.show)
         self._handlers = (
             self._browsing,
@@ -152,7 +152,7 @@ class Controller(Handler):
             PosingHandler(context),
             KeyframeHandler(context),
             self._painting,
-            ImportingHandler(context),
+            self._transfers,
             FilterHandler(context, self._browsing.show),
         )
         self._deliver = deliver
@@ -233,7 +233,9 @@ class Controller(Handler):
 
     def wait_time(self) -> float | None:
         """Time until work is due without a request [s]; None if no work is due."""
-        handlers = (self._optimizing, self._painting, self._browsing, self._live)
+        # Imports are applied after the end of a stream.
+        last = self._live if self._live.active else self._transfers
+        handlers = (self._optimizing, self._painting, self._browsing, last)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
@@ -250,6 +252,8 @@ class Controller(Handler):
         self._painting.advance()
         self._browsing.advance()
         self._live.advance()
+        if not self._live.active:
+            self._transfers.advance()
         if not self._optimizing.computing and self._editor.overdue_in() == 0.0:
             self._context.save()
         self._watch()
@@ -285,6 +289,7 @@ class Controller(Handler):
         Raises:
             CartsError: the stream or the gesture could not be saved.
         """
+        self._transfers.cancel()
         self._live.stop("Stopped.")
         self._context.save()
 

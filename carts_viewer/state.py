@@ -471,6 +471,8 @@ class ViewState:
     error: str | None = None
     notice: str | None = None
     """A message that is not an error."""
+    importing: int | None = None
+    """Number of images that the running import of masks has read; None without an import."""
     imported: str = ""
     """Summary of the last import of masks, as text for the user."""
 

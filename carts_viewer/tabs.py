@@ -270,7 +270,7 @@ class Tabs:
         self.people = People(storage.project)
         session = Session(sequence, self.people, Person(0, present=False))
         self._session = session
-        self.job_runner = JobRunner(self._initial_state(session), session, renderer, optimizers, deliver)
+        self.job_runner = JobRunner(self._initial_state(session), session, renderer, optimizers)
         self._tabs: tuple[Tab, ...] = ()
         self.first = self._add()
 

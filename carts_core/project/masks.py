@@ -173,9 +173,34 @@ def import_annotations(
             have too many labels. In these cases nothing is changed.
         SequenceError: the source cannot be read.
     """
-    state = project.state
-    edits, masks, keypoints = _edits(state, annotations)
+    return apply_annotations(project, annotation_edits(project.state, annotations), source=source, replace=replace)
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotationEdits:
+    """Annotations as edits of a project."""
+
+    annotations: "Annotations"
+    """The annotations, after their iteration."""
+    known: ImportedLabels | None
+    """Labels of the project, which precede new labels."""
+    edits: dict[Key[Any], Any]
+    masks: int
+    """Number of images with masks."""
+    keypoints: int
+    """Number of images with keypoints."""
+
+
+def apply_annotations(project: Project, read: AnnotationEdits, *, source: str, replace: bool = False) -> ImportReport:
+    """Second half of `import_annotations`, with the same arguments and errors.
+
+    Raises:
+        ProjectError: as `import_annotations`, and if the project has other labels than in `annotation_edits`.
+    """
+    state, annotations, edits = project.state, read.annotations, read.edits
     unknown = tuple(annotations.unknown)
+    if state.get(Key.imported_labels()) != read.known:
+        raise ProjectError(f"the imported labels were changed while {source} was read. Import it again.")
     if not edits:
         left = f"{listed(annotations.remarks, 3)}. " if annotations.remarks else ""
         there = left + f"Its images are named {listed([repr(name) for name in unknown[:3]])}. " if unknown else left
@@ -196,11 +221,11 @@ def import_annotations(
     remarks = tuple(
         text if count == 1 else f"{text} ({counted(count, 'image')})" for text, count in annotations.remarks.items()
     )
-    return ImportReport(annotations.kind, masks, keypoints, labels, unknown, change is not None, remarks)
+    return ImportReport(annotations.kind, read.masks, read.keypoints, labels, unknown, change is not None, remarks)
 
 
-def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[Any], Any], int, int]:
-    """Edits, and numbers of images with masks and with keypoints; new labels are numbered after the existing labels."""
+def annotation_edits(state: ProjectState, annotations: "Annotations") -> AnnotationEdits:
+    """First half of `import_annotations`, which reads the source and does not access the project; errors as there."""
     known = state.get(Key.imported_labels())
     names = [] if known is None else list(known.names)
     edits: dict[Key[Any], Any] = {}
@@ -221,4 +246,4 @@ def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[An
             keypoints += 1
     if edits:
         edits[Key.imported_labels()] = ImportedLabels(tuple(names))
-    return edits, masks, keypoints
+    return AnnotationEdits(annotations, known, edits, masks, keypoints)

@@ -6,17 +6,19 @@ import os
 import threading
 import time
 import zipfile
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.export import FORMATS, Dataset, ExportFrame, ExportProgress, Parts, export, mask_png, project_frame
 from carts_core.files import OutputPath, file_name, output_path
 from carts_core.model.camera import Camera
-from carts_core.project import ProjectState, ReviewState, frames_in, import_annotations
+from carts_core.project import ProjectState, ReviewState, frames_in
+from carts_core.project.masks import AnnotationEdits, annotation_edits, apply_annotations
 from carts_core.project.state import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_core.settings import Masks
@@ -62,11 +64,11 @@ Deliver = Callable[[int, str, bytes], None]
 
 
 class ExportingHandler(Handler):
-    """Handler of exports and downloads."""
+    """Handler of exports."""
 
-    def __init__(self, context: Context, optimizers: OptimizerFactory, deliver: Deliver) -> None:
+    def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
         super().__init__(context)
-        self._optimizers, self._deliver = optimizers, deliver
+        self._optimizers = optimizers
         self._job: CooperativeThread[Path] | None = None
         self._intent: intents.Export | None = None
 
@@ -125,12 +127,6 @@ class ExportingHandler(Handler):
 
     def _on_CancelExport(self, intent: intents.CancelExport) -> None:
         self.cancel()
-
-    def _on_Download(self, intent: intents.Download) -> None:
-        export_state = self._context.state.export
-        if export_state is None or export_state.path is None:
-            raise CartsError("Nothing has been exported yet.")
-        self._deliver(intent.client_id, *zipped(export_state.path))
 
     # ---- The export ------------------------------------------------------------------------------------------------
 
@@ -223,8 +219,8 @@ MAX_DOWNLOAD = 512 * 2**20
 _COMPRESSED = {".png", ".jpg", ".mp4", ".npz"}
 
 
-def zipped(path: Path) -> tuple[str, bytes]:
-    """Name and content of a download: a file unchanged, a folder as a zip archive.
+def _files_to_send(path: Path) -> list[Path]:
+    """Files of a download.
 
     Raises:
         CartsError: the export no longer exists, or is too large for a browser.
@@ -238,6 +234,11 @@ def zipped(path: Path) -> tuple[str, bytes]:
             f"{path} has {size / 2**20:.0f} MiB; the limit for downloads is {MAX_DOWNLOAD // 2**20} MiB. "
             "Copy it from that path."
         )
+    return files
+
+
+def _zipped(path: Path, files: Sequence[Path]) -> tuple[str, bytes]:
+    """Name and content of a download: a file unchanged, a folder as a zip archive."""
     if path.is_file():
         return path.name, path.read_bytes()
     content = io.BytesIO()
@@ -358,21 +359,100 @@ class CooperativeThread(Generic[T]):
 _MAX_PATH_LENGTH = 4096
 
 
-class ImportingHandler(Handler):
-    """Handler of imported masks and keypoints."""
+_WAIT = 0.02
+"""Maximum wait for a thread, during which intents are delayed [s]."""
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(4, thread_name_prefix="carts-transfer")
+
+
+class TransferHandler(Handler):
+    """Handler of downloads and of imported masks and keypoints, whose files are read on other threads."""
+
+    def __init__(self, context: Context, deliver: Deliver) -> None:
+        super().__init__(context)
+        self._deliver = deliver
+        self._running: dict[Future[Any], Callable[[Future[Any]], None]] = {}
+        """Function that uses the result, by running thread."""
+        self._import: Future[AnnotationEdits] | None = None
+        self._cancelled = threading.Event()
+        self._read = 0
+        """Number of images that the import has read."""
+
+    def wait_time(self) -> float | None:
+        """Time until the next step is due [s]: 0 while a thread runs, otherwise None."""
+        return 0.0 if self._running else None
+
+    def advance(self) -> None:
+        """Wait up to `_WAIT` for the threads, and use their results.
+
+        Raises:
+            CartsError: the files cannot be read, or the import is refused; the project is unchanged.
+        """
+        if not self._running:
+            return
+        ended = wait(self._running, _WAIT, FIRST_COMPLETED).done
+        if self._context.state.importing not in (None, self._read):
+            self._context.change(importing=self._read)
+        for thread in ended:
+            self._running.pop(thread)(thread)
+
+    def cancel(self) -> None:
+        """Cancel the running import, which leaves the project unchanged."""
+        self._cancelled.set()
+        if self._import is not None:
+            self._running.pop(self._import, None)
+        self._context.change(importing=None)
+
+    # ---- Intents ---------------------------------------------------------------------------------------------------
+
+    def _on_Download(self, intent: intents.Download) -> None:
+        export_state = self._context.state.export
+        if export_state is None or export_state.path is None:
+            raise CartsError("Nothing has been exported yet.")
+        thread = _threads().submit(_zipped, export_state.path, _files_to_send(export_state.path))
+        self._running[thread] = lambda packed: self._deliver(intent.client_id, *packed.result())
 
     def _on_ImportMasks(self, intent: intents.ImportMasks) -> None:
+        if self._context.state.importing is not None:
+            raise CartsError("An import is already running. Wait, or cancel it first.")
         session = self._session
         given = intent.path.strip()[:_MAX_PATH_LENGTH]
         if not given:
             raise CartsError("Enter the path of the masks: an annotation file, or a folder of masks or labels.")
         path = session.roots.checked(session.sequence.path.parent.absolute() / os.path.expanduser(given))
-        from carts_core.recording.annotations import read_annotations  # noqa: PLC0415  imports all importers
+        sequence, state = session.sequence, session.editor.project.state
+        self._read, self._cancelled = 0, threading.Event()
 
-        found = read_annotations(path, session.sequence, intent.camera, format=intent.format, confined=True)
+        def read(cancelled: threading.Event = self._cancelled) -> AnnotationEdits:
+            from carts_core.recording.annotations import read_annotations  # noqa: PLC0415  imports all importers
+
+            found = read_annotations(path, sequence, intent.camera, format=intent.format, confined=True)
+            return annotation_edits(state, replace(found, frames=self._counted(found.frames, cancelled)))
+
+        self._import = _threads().submit(read)
+        self._running[self._import] = lambda found: self._apply(found, path.name, replace=intent.replace)
+        self._context.change(importing=0, error=None)
+
+    def _on_CancelImport(self, intent: intents.CancelImport) -> None:
+        self.cancel()
+
+    def _counted(self, frames: Iterator[T], cancelled: threading.Event) -> Iterator[T]:
+        for frame in frames:
+            if cancelled.is_set():
+                raise CartsError("Cancelled.")
+            self._read += 1
+            yield frame
+
+    def _apply(self, found: Future[AnnotationEdits], source: str, *, replace: bool) -> None:
+        """Apply an import that was read."""
+        self._context.change(importing=None)
+        read, session = found.result(), self._session
         self._context.end_run("Stopped: masks were imported")
         self._context.save()
-        report = import_annotations(session.editor.project, found, source=path.name, replace=intent.replace)
+        report = apply_annotations(session.editor.project, read, source=source, replace=replace)
         if report.changed:
             session.editor.claim()
         self._context.refresh()

@@ -529,7 +529,7 @@ class RemoveEndedJobs(Jobs):
 
 
 class Exporting(Intent):
-    """An intent about exports and downloads."""
+    """An intent about exports."""
 
 
 class ExportMask(Intent):
@@ -560,7 +560,7 @@ class CancelExport(Exporting):
     """Cancel the running export; its files are removed."""
 
 
-class Download(Exporting):
+class Download(Intent):
     """Send the last export to the requesting tab."""
 
     client_id: int
@@ -577,6 +577,10 @@ class ImportMasks(Intent):
     """Format of the source; None to recognize it by content."""
     replace: bool = False
     """Whether previously imported layers may be replaced."""
+
+
+class CancelImport(Intent):
+    """Cancel the running import; the project is unchanged."""
 
 
 class SetFilter(Intent):

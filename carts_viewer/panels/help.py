@@ -104,6 +104,7 @@ HINTS = {
     "Copy images": "Copy the images beside their labels; otherwise labels refer to the recording's images",
     "Export": "Write the frames to a new file or folder beside the project, as a job",
     "Cancel export": "Cancel the export and remove its files",
+    "Cancel import": "Cancel the import; the project is unchanged",
     "Download": "Send the last export to this browser",
     "Export mask": "Download this frame's mask of the shown camera as PNG (255 is arm), refined if the layer "
     "Refined mask is shown",

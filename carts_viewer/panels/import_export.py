@@ -5,6 +5,7 @@ import viser
 from carts_core.export import FORMATS, FormatName, formats_of
 from carts_core.project import Key, ProjectState, ReviewState
 from carts_core.settings import ANNOTATION_FORMATS, AnnotationFormat
+from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings, frames_within
 from carts_viewer.panels.inputs import PanelPage
@@ -142,6 +143,7 @@ class ImportPanel:
             self._format = gui.add_dropdown("Source format", [*_FORMATS], hint="Format of the annotations")
             self._replace = gui.add_checkbox("Replace", False, hint="Replace earlier imports")
             self._import = page.button("Import masks", lambda _: self._intent(), icon=viser.Icon.FILE_IMPORT)
+            self._cancel = page.button("Cancel import", intents.CancelImport(), icon=viser.Icon.X, visible=False)
             self._text = gui.add_html("")
 
     def _intent(self) -> intents.ImportMasks:
@@ -153,7 +155,10 @@ class ImportPanel:
         """Update the text."""
         there = state.project.get(Key.imported_labels()) is not None
         content = "Nothing has been imported yet."
-        if there:
+        self._import.disabled = self._cancel.visible = state.importing is not None
+        if state.importing is not None:
+            content = f"Importing: {counted(state.importing, 'image')} read."
+        elif there:
             content = escaped(state.imported) or "The layer <i>Imported masks</i> shows the imports."
         if self._text.content != (wanted := f'<p class="carts-caption">{content}</p>'):
             self._text.content = wanted

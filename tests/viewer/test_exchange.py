@@ -1,10 +1,13 @@
 """Exports of the page, imported masks and keypoints, and the target of a run."""
 
 import json
+import threading
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +15,7 @@ import pyarrow.parquet
 import pytest
 from lerobot_sets import dataset as lerobot_set
 from viewer_desk import Desk
-from viewer_tab import OpenViewer, decoded, widget
+from viewer_tab import OpenViewer, decoded, place_of, widget
 from waiting import eventually
 
 from carts_core.errors import CartsError, SettingsError
@@ -33,8 +36,9 @@ from carts_core.project import (
     Source,
     import_annotations,
 )
-from carts_core.recording import Sequence
+from carts_core.recording import Sequence, annotations
 from carts_core.recording.annotations import read_annotations
+from carts_core.recording.annotations.images import Annotations, FrameAnnotation
 from carts_core.recording.importing.importer import import_recording
 from carts_core.settings import Masks
 from carts_viewer.actions import import_export as exporting
@@ -170,6 +174,7 @@ def test_a_package_that_is_missing_is_named(desk: Desk, monkeypatch: pytest.Monk
 def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     path = exported(desk, intents.Export("coco", "All"))
     desk.do(intents.Download(4))
+    desk.finish()
     client, name, content = desk.delivered[-1]
     with zipfile.ZipFile(BytesIO(content)) as archived:
         assert (client, name) == (4, "coco.zip")
@@ -177,6 +182,7 @@ def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.Mon
         assert len(archived.namelist()) == sum(file.is_file() for file in path.rglob("*"))
     table = exported(desk, intents.Export("csv", "All"))
     desk.do(intents.Download(4))
+    desk.finish()
     assert desk.delivered[-1] == (4, "kinematics.csv", table.read_bytes())
     monkeypatch.setattr(exporting, "MAX_DOWNLOAD", 10)
     with pytest.raises(CartsError, match="Copy it from that path"):
@@ -218,6 +224,7 @@ def write_theirs(folder: Path, frames: tuple[int, ...] = (1, 2)) -> np.ndarray:
 def bring_in(desk: Desk, **options) -> np.ndarray:
     mask = write_theirs(desk.session.sequence.path.parent)
     desk.do(intents.ImportMasks("theirs.json", **options))
+    desk.finish()
     return mask
 
 
@@ -234,6 +241,42 @@ def test_masks_of_others_are_imported_and_chosen_in_the_panels(open_viewer: Open
         tab.set(app.page.element_id(widget(app, tab, "Import masks")), True)
         eventually(lambda: app.state.imported)
         assert app.wait_until_shown().imported == ("Imported 2 masks and keypoints of 2 images from COCO (grasper).")
+
+
+def test_an_import_holds_up_no_other_tab_and_can_be_cancelled(
+    open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on = threading.Event()
+
+    def held(frames: Iterator[FrameAnnotation]) -> Iterator[FrameAnnotation]:
+        yield next(frames)
+        goes_on.wait(60)
+        yield from frames
+
+    def slow(*arguments: Any, **options: Any) -> Annotations:
+        found = read_annotations(*arguments, **options)
+        return replace(found, frames=held(found.frames))
+
+    monkeypatch.setattr(annotations, "read_annotations", slow)
+    app = open_viewer(write_theirs, masks=False)
+    with RawTab(app.url) as tab, RawTab(app.url) as other:
+        mine = place_of(app, tab).controller
+
+        def press(label: str) -> None:
+            tab.set(app.page.element_id(widget(app, tab, label)), True)
+
+        tab.set(app.page.element_id(widget(app, tab, "From")), "theirs.json")
+        press("Import masks")
+        eventually(lambda: mine.state.importing, lambda count: count == 1)
+        other.set(app.page.element_id(widget(app, other, "Frame")), 2)
+        eventually(lambda: place_of(app, other).controller.state.index, lambda index: index == 1)
+        assert mine.state.importing == 1
+        press("Cancel import")
+        eventually(lambda: mine.state.importing, lambda count: count is None)
+        goes_on.set()
+        assert not app.wait_until_shown().project.steps and mine.state.error is None
+        press("Import masks")
+        eventually(lambda: mine.state.imported, lambda text: "Imported 2 masks" in text)
 
 
 def test_an_import_is_one_step_shown_at_once_and_compared_with_where_the_recording_has_no_masks(plain: Desk) -> None:
@@ -302,10 +345,11 @@ def test_the_format_is_chosen_where_a_folder_has_several(plain: Desk) -> None:
     assert cv2.imwrite(str(folder / "002.png"), np.full((72, 96), 255, np.uint8))
     with pytest.raises(CartsError, match=r"several formats .* Source format"):
         plain.do(intents.ImportMasks("theirs"))
+        plain.finish()
     plain.do(intents.ImportMasks("theirs", format="labelme"))
-    assert plain.state.imported == "Imported 1 mask from X-AnyLabeling (shaft)."
+    assert plain.finish().imported == "Imported 1 mask from X-AnyLabeling (shaft)."
     plain.do(intents.ImportMasks("theirs", format="masks"))
-    assert "from a folder of masks (shaft, instrument)" in plain.state.imported
+    assert "from a folder of masks (shaft, instrument)" in plain.finish().imported
 
 
 def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
@@ -314,7 +358,7 @@ def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[...,
     elsewhere = tmp_path.parent / f"{tmp_path.name}_elsewhere"
     elsewhere.mkdir()
     assert cv2.imwrite(str(elsewhere / "001.png"), np.full((72, 96), 255, np.uint8))
-    link = tmp_path / "link"
+    link = tmp_path.parent / f"{tmp_path.name}_link"
     link.symlink_to(elsewhere)
     with ViewerApp.open(folder / path.name, port=0, folders=(link,)) as app:
         app.queue.put(intents.ImportMasks(str(link)))

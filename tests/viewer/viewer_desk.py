@@ -48,7 +48,7 @@ class Desk:
         def deliver(*file: Any) -> None:
             self.delivered.append(file)
 
-        self.job_runner = JobRunner(state, own, self.renderer, factory, deliver)
+        self.job_runner = JobRunner(state, own, self.renderer, factory)
         self.controller = Controller(state, self.session, self.renderer, factory, self.job_runner, deliver)
 
     @classmethod
