@@ -1,6 +1,7 @@
 """LeRobot data sets, v2.1 and v3.0 (Open-H-Embodiment): Parquet tables and videos, without the package `lerobot`."""
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,12 +139,15 @@ def _parquet(path: Path) -> ForeignTable:
 
 
 def feature_names(value: Any) -> list[str]:
-    """Column names of a feature, which may be nested in lists or under a key."""
+    """Column names of a feature, which may be nested in lists or under keys; if they repeat under several keys, the key
+    is prefixed, as in `psm1.yaw`."""
     if isinstance(value, str):
         return [value]
-    if isinstance(value, dict):
-        value = list(value.values())
-    return [name for entry in value or () for name in feature_names(entry)]
+    if not isinstance(value, dict):
+        return [name for entry in value or () for name in feature_names(entry)]
+    keyed = [(key, name) for key, entry in value.items() for name in feature_names(entry)]
+    names = [name for _, name in keyed]
+    return names if len(set(names)) == len(names) else [f"{key}.{name}" for key, name in keyed]
 
 
 def state_table(root: Path, features: dict[str, Any], episode: Episode) -> ForeignTable:
@@ -156,6 +160,11 @@ def state_table(root: Path, features: dict[str, Any], episode: Episode) -> Forei
     if values.ndim != 2 or len(names) != values.shape[1]:
         raise SequenceError(
             f"{root}: {STATE} has {values.shape[-1]} columns and {len(names)} names in meta/info.json. Correct them."
+        )
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
+        raise SequenceError(
+            f"{root}: {STATE} has several columns with the same name in meta/info.json: {', '.join(repeated)}. Rename "
+            "them, such as psm1_yaw and psm2_yaw."
         )
     return ForeignTable(root / "meta/info.json", {name: values[:, index] for index, name in enumerate(names)})
 

@@ -14,6 +14,7 @@ from videos import write_video
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
+from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.settings.interchange import ImportOptions
@@ -51,6 +52,20 @@ def test_a_second_episode_in_a_shared_video_begins_where_it_begins(tmp_path):
     assert found.cameras[0].numbers is not None and found.cameras[0].numbers.tolist() == list(range(4, 10))
 
 
+def test_joints_with_equal_names_under_the_keys_of_two_arms_become_two_arms(tmp_path):
+    path = dataset(tmp_path / "set")
+    joints = [*JOINT_NAMES, "jaw"]
+    info_changed(lambda c: c["features"]["observation.state"].update(names={"psm1": joints, "psm2": joints}))(path)
+    file = path / FIRST
+    rows = [[*joints_at(n / 30), 0.1, *joints_at(1 + n / 30), 0.2] for n in range(LENGTHS[0])]
+    table = pyarrow.parquet.read_table(file)
+    pyarrow.parquet.write_table(table.set_column(0, "observation.state", pyarrow.array(rows)), file)
+    sequence = Sequence.open(import_recording(path, tmp_path / "out")[0])
+    assert list(sequence.measured) == ["PSM1", "PSM2"]
+    for number, values in enumerate(sequence.measured.values()):
+        np.testing.assert_allclose(values, np.array(rows)[:, 7 * number : 7 * number + 7], rtol=0, atol=1e-8)
+
+
 def info_changed(change: Callable[[dict], object]) -> Callable[[Path], object]:
     def mutate(path: Path) -> None:
         content = json.loads((path / "meta/info.json").read_text())
@@ -69,6 +84,10 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no state": (info_changed(lambda c: c["features"].pop("observation.state")), "has no feature observation.state"),
     "names are too few": (info_changed(lambda c: c["features"]["observation.state"].update(names=["x"])), "1 names"),
     "no names": (info_changed(lambda c: c["features"]["observation.state"].update(names=None)), "0 names"),
+    "repeated names": (
+        info_changed(lambda c: c["features"]["observation.state"].update(names=["yaw", "pitch", "roll", "jaw"] * 2)),
+        "several columns with the same name in meta/info.json: yaw, pitch, roll, jaw",
+    ),
     "unknown names": (
         info_changed(lambda c: c["features"]["observation.state"].update(names=[f"motor{c}" for c in "abcdefgh"])),
         "neither six joints of a PSM",
