@@ -40,7 +40,7 @@ from .dataset import Dataset, ExportProgress
 from .encodings import image_png
 from .kinematics import joint_columns, position_values, std_values
 from .recording_copy import below, copy_files
-from .source_tables import ColumnMaps, as_imported, column_maps, rows_of_frames, source_of
+from .source_tables import ColumnMaps, as_imported, column_maps, frame_positions, rows_of_frames, source_of
 
 CORRECTED_STATE = "observation.state_corrected"
 POSITIONS, STD = "carts.joint_positions", "carts.joint_std"
@@ -71,7 +71,7 @@ class _Masks:
 
 @dataclass(frozen=True, eq=False)
 class _Results:
-    """Results of the exported frames, and their rows in the episode."""
+    """Results of the exported frames, and the rows of all frames in the episode."""
 
     dataset: Dataset
     episode: Episode
@@ -128,10 +128,9 @@ def _results(
         size = camera.height, camera.width
         key = keys.get(camera.name, f"observation.images.{camera.name.replace('/', '_')}")
         masks.append(_Masks(f"{key}_mask", size, [_mask_file(np.zeros(size, bool))], [0.0]))
-    exported = rows[[frame.index for frame in dataset.frames]]
     kind = str(features[STATE].get("dtype", "float32"))
     kind = kind if kind in ("float32", "float64") else "float32"
-    return _Results(dataset, episode, exported, maps, feature_names(features[STATE].get("names")), kind, masks)
+    return _Results(dataset, episode, rows, maps, feature_names(features[STATE].get("names")), kind, masks)
 
 
 def _mask_file(mask: ndarray) -> bytes:
@@ -142,12 +141,11 @@ def _mask_file(mask: ndarray) -> bytes:
 def _collect_masks(results: _Results, progress: ExportProgress) -> None:
     """Render the masks of all frames as files of the recorded images' size."""
     dataset = results.dataset
-    row_of = {frame.index: int(row) for frame, row in zip(dataset.frames, results.rows, strict=True)}
     masks = dict(zip((camera.name for camera in dataset.scene.cameras), results.masks, strict=True))
     for view in dataset.views(progress):
         recorded = dataset.sequence.recorded_camera(view.camera.name)
-        mask, own, row = recorded.distorted_mask(view.link_ids >= 0), masks[view.camera.name], row_of[view.frame.index]
-        own.rows[row] = len(own.files)
+        mask, own = recorded.distorted_mask(view.link_ids >= 0), masks[view.camera.name]
+        own.rows[int(results.rows[view.frame.index])] = len(own.files)
         own.files.append(_mask_file(mask))
         own.shares.append(float(mask.mean()))
 
@@ -195,13 +193,13 @@ def _columns(
     """New columns of a data file, for `extended_parquet`; rows other than `own` keep earlier results."""
     dataset, scene = results.dataset, results.dataset.scene
     frames = dataset.frames if len(own) else ()
-    place = own[results.rows] if len(own) else np.zeros(0, int)
     width = len(joint_columns(scene))
     positions = _earlier(recorded, POSITIONS, (rows, width), np.nan, own)
     std = _earlier(recorded, STD, (rows, width), np.nan, own)
     corrected = _earlier(recorded, CORRECTED, (rows,), 0.0, own).astype(bool)
     sources, verdicts = (_earlier_texts(recorded, name, rows, own) for name in (SOURCE, VERDICT))
-    for frame, row in zip(frames, place.tolist(), strict=True):
+    for frame in frames:
+        row = own[results.rows[frame.index]]
         positions[row], std[row] = position_values(scene, frame), std_values(scene, frame)
         corrected[row] = frame.source != "measured"
         sources[row], verdicts[row] = frame.source, frame.verdict or ""
@@ -231,7 +229,7 @@ def _state(
     if len(own):
         found[own] = state[own]
         columns = {name: state[own, number] for number, name in enumerate(results.state_names)}
-        corrected = results.maps.corrected(columns, results.dataset.frames, results.rows)
+        corrected = results.maps.corrected(columns, *frame_positions(results.dataset), results.rows)
         for name, values in corrected.items():
             found[own, results.state_names.index(name)] = values
     return found

@@ -26,7 +26,7 @@ from ..recording.importing.logs import ACCEPTED, CANDIDATES, fit_base_frame, fit
 from ..recording.kinematics_table import LENGTH_UNITS
 from ..settings.interchange import ImportOptions
 from ..wording import counted
-from .dataset import ExportFrame
+from .dataset import Dataset
 
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """Components of a tip pose: position and quaternion."""
@@ -98,6 +98,30 @@ def rows_of_frames(
     return found
 
 
+def frame_positions(
+    dataset: Dataset,
+) -> tuple[dict[str, Float[ndarray, "frames dofs"]], Bool[ndarray, " frames"]]:
+    """Joint positions of all frames of the sequence, and whether they replace those of the frames' rows.
+
+    Returns:
+        Arm -> joint positions [rad, m]; and the replaced frames. These are the corrected frames, or with a time offset
+        all, since their rows are of other times than their images.
+    """
+    sequence, matching = dataset.sequence, dataset.sequence.matching
+    changed = np.zeros(len(sequence), bool)
+    if matching is not None and (matching.time_offset or any(sequence.arm_time_offsets.values())):
+        # The joint positions of the dataset's sequence may be corrected ones.
+        sequence = sequence.with_time_offset(matching.time_offset)
+        changed[:] = True
+    positions = {arm: values.copy() for arm, values in sequence.measured.items()}
+    for frame in dataset.frames:
+        if frame.source != "measured":
+            changed[frame.index] = True
+            for arm, values in frame.joint_positions.items():
+                positions[arm][frame.index] = values
+    return positions, changed
+
+
 @dataclass(frozen=True, eq=False)
 class JointMap:
     """Conversion of one joint: column = scale * position + offset."""
@@ -148,33 +172,29 @@ class ColumnMaps:
     def corrected(
         self,
         columns: Mapping[str, Float[ndarray, " rows"]],
-        frames: Sequence[ExportFrame],
+        positions: Mapping[str, Float[ndarray, "frames dofs"]],
+        changed: Bool[ndarray, " frames"],
         rows: Int[ndarray, " frames"],
     ) -> dict[str, Float[ndarray, " rows"]]:
-        """Corrected columns; recorded values remain in rows without a corrected frame.
+        """Columns with the values of the changed frames; recorded values remain in other rows.
 
         Args:
             columns: the recorded columns.
-            frames: exported frames; those with the source `measured` are not corrected.
-            rows: row of each exported frame.
+            positions: arm -> joint positions of all frames [rad, m].
+            changed: frames whose positions replace those of their rows.
+            rows: row of each frame.
         """
-        own = [(frame, row) for frame, row in zip(frames, rows.tolist(), strict=True) if frame.source != "measured"]
         found = {name: np.asarray(columns[name], np.float64).copy() for name in self.meanings}
-        if not own:
-            return found
-        changed = np.array([row for _, row in own])
-        positions = {
-            arm: np.stack([frame.joint_positions[arm] for frame, _ in own]) for arm in own[0][0].joint_positions
-        }
         for joint in self.joints:
-            found[joint.column][changed] = joint.scale * positions[joint.arm][:, joint.index] + joint.offset
+            values = joint.scale * positions[joint.arm][:, joint.index] + joint.offset
+            found[joint.column][rows[changed]] = values[changed]
         for pose in self.poses:
             values = pose.poses(positions[pose.arm][:, pose.joints])
-            recorded = np.stack([columns[name][changed] for name in pose.columns[3:]], 1)
+            recorded = np.stack([columns[name][rows] for name in pose.columns[3:]], 1)
             # A quaternion and its negative are the same rotation; the recorded sign is kept.
             values[:, 3:] *= np.where((values[:, 3:] * recorded).sum(1) < 0, -1.0, 1.0)[:, None]
             for name, corrected in zip(pose.columns, values.T, strict=True):
-                found[name][changed] = corrected
+                found[name][rows[changed]] = corrected[changed]
         return found
 
 

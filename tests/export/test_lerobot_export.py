@@ -14,7 +14,7 @@ from recordings import digests, pose_of
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
-from carts_core.export import Dataset, ExportProgress, export, formats_of, kinematics_csv
+from carts_core.export import Dataset, ExportProgress, export, formats_of, kinematics_csv, measured_frames
 from carts_core.export.kinematics import joint_columns
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
@@ -170,6 +170,19 @@ def test_videos_are_linked_copied_or_left_out(tmp_path):
         assert sorted(file.relative_to(out) for file in out.rglob("*.mp4")) == ([] if images == "none" else videos)
         assert all((out / file).is_symlink() == (images == "named") for file in videos if images != "none")
         assert all((out / file).read_bytes() == (path / file).read_bytes() for file in videos if images != "none")
+
+
+def test_with_a_time_offset_the_state_of_every_frame_is_at_the_time_of_its_image(tmp_path):
+    path = dataset(tmp_path / "set", names=JOINTS)
+    options = ImportOptions(time_offset=1 / 30)
+    sequence = Sequence.open(import_recording(path, tmp_path / "sequence", options)[0])
+    frames = [replace(frame, source="optimized") for frame in measured_frames(sequence, range(3))]
+    frames[1] = replace(frames[1], source="measured")
+    data = Dataset(sequence, tuple(frames), sequence.scene, "regular")
+    rows = episode_rows(export(data, "lerobot", tmp_path / "out"), 0)
+    assert rows["carts.corrected"] == [True, False, True, False]
+    shifted = np.array(rows["observation.state"])[[1, 2, 3, 3], :7]
+    np.testing.assert_allclose(np.array(rows[STATE])[:, :7], shifted, rtol=0, atol=1e-8)
 
 
 def test_single_precision_states_stay_single(tmp_path):
