@@ -30,7 +30,7 @@ from ..settings.interchange import ImportOptions
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .encodings import mask_png
 from .recording_copy import below
-from .source_tables import POSE, JointMap, PoseMap, joint_maps, pose_map, source_of
+from .source_tables import POSE, JointMap, PoseMap, frame_positions, joint_maps, pose_map, source_of
 
 _SUFFIXES = (".csv", ".tsv", ".txt")
 _SAME_CLOCK = 1e-5
@@ -42,9 +42,11 @@ class _RowResults:
     """Results in the rows of a table that belong to the sequence."""
 
     positions: Float[ndarray, "rows dofs"]
-    """Corrected joint positions [rad, m]; as recorded in rows without results."""
+    """Joint positions [rad, m]."""
+    changed: Bool[ndarray, " rows"]
+    """Rows whose positions replace the recorded values."""
     std: Float[ndarray, "rows dofs"]
-    corrected: Bool[ndarray, " rows"]
+    """Standard deviations [rad, m]; NaN in rows without results."""
     frames: Int[ndarray, " rows"]
     """Index in the exported frames of the frame nearest in time; -1 in rows without results."""
 
@@ -120,7 +122,10 @@ def _arm_columns(
         pose = pose_map(arm.name, arm.robot, places, recorded, values)
     if not joints and pose is None:
         return {}
-    results = _by_row(dataset, arm.name, values) if times is None else _by_time(dataset, arm.name, times, values)
+    if times is None or _is_row_per_frame(times + sequence.arm_time_offsets[arm.name], sequence.timestamps):
+        results = _by_row(dataset, arm.name)
+    else:
+        results = _by_time(dataset, arm.name, times, values)
     decimal = "," if DECIMAL_COMMAS in table.remarks else "."
     return _texts(table, arm.name, rows, results, joints, pose, dataset.frames, decimal)
 
@@ -157,16 +162,20 @@ def _rows(
     return None
 
 
-def _by_row(dataset: Dataset, arm: str, values: Float[ndarray, "rows dofs"]) -> _RowResults:
+def _is_row_per_frame(times: Float[ndarray, " rows"], timestamps: Float[ndarray, " frames"] | None) -> bool:
+    """Whether rows have the times of the frames, as an import assigns them to a table with a row per image."""
+    return timestamps is not None and len(times) == len(timestamps) and np.abs(times - timestamps).max() <= _SAME_CLOCK
+
+
+def _by_row(dataset: Dataset, arm: str) -> _RowResults:
     """Results of a table with a row per frame."""
-    positions, std = values.copy(), np.full(values.shape, np.nan)
-    frames = np.full(len(values), -1)
+    positions, changed = frame_positions(dataset)
+    std, frames = np.full(positions[arm].shape, np.nan), np.full(len(changed), -1)
     for number, frame in enumerate(dataset.frames):
         if frame.source != "measured":
-            positions[frame.index] = frame.joint_positions[arm]
-            std[frame.index] = (frame.joint_std or {}).get(arm, std[frame.index])
+            std[frame.index] = (frame.joint_std or {}).get(arm, np.nan)
             frames[frame.index] = number
-    return _RowResults(positions, std, frames >= 0, frames)
+    return _RowResults(positions[arm], changed, std, frames)
 
 
 def _by_time(
@@ -179,7 +188,7 @@ def _by_time(
     own = [number for number, frame in enumerate(frames) if frame.source != "measured"]
     positions, std, nearest = values.copy(), np.full(values.shape, np.nan), np.full(len(values), -1)
     if not own:
-        return _RowResults(positions, std, nearest >= 0, nearest)
+        return _RowResults(positions, nearest >= 0, std, nearest)
     at = np.array([timestamps[frames[number].index] for number in own]) + sequence.checked_matching().time_offset
     # A frame shortly before the first row, or after the last one, has the values of that row.
     at = np.clip(at, times[0], times[-1])
@@ -196,7 +205,7 @@ def _by_time(
     positions[inside] += interpolated[inside]
     std[inside] = deviations[chosen[inside]]
     nearest[inside] = np.array(own)[chosen[inside]]
-    return _RowResults(positions, std, inside, nearest)
+    return _RowResults(positions, inside, std, nearest)
 
 
 def _texts(
@@ -221,10 +230,9 @@ def _texts(
         columns |= {f"{name}.corrected": value for name, value in zip(pose.columns, values.T, strict=True)}
     found = {}
     for name, values in columns.items():
-        source = name.removesuffix(".corrected")
-        texts = ["nan" if name.endswith(".std") else repr(float(value)) for value in _recorded(table, source)]
-        for row, value, corrected in zip(rows.tolist(), values.tolist(), results.corrected.tolist(), strict=True):
-            texts[row] = repr(value) if corrected else texts[row]
+        texts = [repr(float(value)) for value in _recorded(table, name.removesuffix(".corrected"))]
+        for row, value, changed in zip(rows.tolist(), values.tolist(), results.changed.tolist(), strict=True):
+            texts[row] = repr(value) if changed else texts[row]
         found[name] = [text.replace(".", decimal) for text in texts]
     marks, verdicts = ["0"] * len(table), [""] * len(table)
     for row, number in zip(rows.tolist(), results.frames.tolist(), strict=True):

@@ -76,6 +76,17 @@ def test_a_row_per_image_gets_the_values_of_its_frame_in_the_units_of_the_table(
         assert mask is not None and ((mask > 127) == (view.link_ids >= 0)).all()
 
 
+def test_a_row_per_image_with_a_time_offset_gets_the_values_of_its_frame(tmp_path):
+    path = with_rows_per_image(tmp_path / "set")
+    data = imported(path, tmp_path / "sequence", ImportOptions(frame_rate=RATE, time_offset=1 / RATE))
+    data = replace(data, frames=data.frames[:-1])
+    _, *rows = rows_of(export(data, "recorded-csv", tmp_path / "out") / "kinematics.csv", delimiter=";")
+    expected = [*(frame.joint_positions["PSM1"] for frame in data.frames), data.sequence.measured["PSM1"][-1]]
+    found = np.radians([float(row["yaw.corrected"]) for row in rows])
+    np.testing.assert_allclose(found, np.array(expected)[:, 0], rtol=0, atol=1e-9)
+    assert [row["PSM1.corrected"] for row in rows] == ["1", "0", "1", "1", "1", "0"]
+
+
 def with_a_log(path: Path) -> Path:
     """As dvrk_data extracts topics: comment lines, nanoseconds, 100 rows a second."""
     write_images(path / "left", FRAMES)
