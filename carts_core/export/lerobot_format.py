@@ -33,8 +33,8 @@ from ..recording.sources.lerobot import (
     read_episode,
     read_info,
     state_table,
-    videos_by_camera,
 )
+from ..recording.video import Video
 from ..settings.interchange import ImportOptions
 from .dataset import Dataset, ExportProgress
 from .encodings import image_png
@@ -122,15 +122,21 @@ def _results(
     rows = rows_of_frames(sequence, len(episode.table), times, where)
     state = state_table(root, features, episode)
     maps = column_maps(state, sequence, rows, where)
-    keys = videos_by_camera(episode)
     masks = []
     for camera in dataset.scene.cameras:
         size = camera.height, camera.width
-        key = keys.get(camera.name, f"observation.images.{camera.name.replace('/', '_')}")
+        key = _video_feature(dataset, camera.name, episode) or f"observation.images.{camera.name}"
         masks.append(_Masks(f"{key}_mask", size, [_mask_file(np.zeros(size, bool))], [0.0]))
     kind = str(features[STATE].get("dtype", "float32"))
     kind = kind if kind in ("float32", "float64") else "float32"
     return _Results(dataset, episode, rows, maps, feature_names(features[STATE].get("names")), kind, masks)
+
+
+def _video_feature(dataset: Dataset, camera: str, episode: Episode) -> str | None:
+    """Feature whose folder has the video of a camera, also in a copy of the data set; None for other images."""
+    source = dataset.sequence.image_source(camera)
+    folders = source.path.parts if isinstance(source, Video) else ()
+    return next((folder for folder in reversed(folders) if folder in episode.videos), None)
 
 
 def _mask_file(mask: ndarray) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from corrected_frames import corrected
-from lerobot_sets import JOINTS, LENGTHS, POSES, STATISTICS, dataset
+from lerobot_sets import CAMERAS, JOINTS, LENGTHS, POSES, STATISTICS, dataset
 from recordings import digests, pose_of
 
 from carts_core.cli import main
@@ -121,6 +121,18 @@ def test_masks_are_images_of_the_rendered_masks_and_empty_elsewhere(tmp_path, ve
         expected = np.repeat((view.link_ids >= 0)[..., None] * np.uint8(255), 3, -1)
         np.testing.assert_array_equal(pixels(entry), expected)
     assert not any(pixels(entry).any() for entry in episode_rows(out, 1)[MASK])
+
+
+def test_masks_have_the_names_of_the_videos_that_were_chosen_for_their_cameras(tmp_path):
+    left, right = CAMERAS
+    options = ImportOptions(images={"left": right, "right": left})
+    path, _ = import_recording(dataset(tmp_path / "set"), tmp_path / "sequence", options)
+    sequence = Sequence.open(path)
+    data = Dataset(sequence, tuple(corrected(sequence)), sequence.scene.with_cameras(["left"]), "regular")
+    rows = episode_rows(export(data, "lerobot", tmp_path / "out"), 0)
+    assert MASK not in rows
+    for view, entry in zip(data.views(ExportProgress()), rows[f"{right}_mask"], strict=True):
+        assert ((pixels(entry)[..., 0] > 0) == (view.link_ids >= 0)).all()
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])

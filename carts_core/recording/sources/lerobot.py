@@ -188,15 +188,11 @@ def _arms(root: Path, features: dict[str, Any], episode: Episode, job: Import) -
     return tuple(arms)
 
 
-def videos_by_camera(episode: Episode) -> dict[str, str]:
-    """Camera -> feature with its video, as named by an import without options."""
-    return {side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos}
-
-
 def _cameras(root: Path, episode: Episode, kept: np.ndarray, times: np.ndarray, job: Import) -> tuple[FoundCamera, ...]:
     rows = len(times)
     cameras = []
-    for name, key in sorted((job.options.images or videos_by_camera(episode)).items()):
+    named = {side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos}
+    for name, key in sorted((job.options.images or named).items()):
         if key not in episode.videos:
             raise SequenceError(f"{root} has no video {key!r}. It has: {', '.join(episode.videos) or 'none'}.")
         video, start = episode.videos[key]
