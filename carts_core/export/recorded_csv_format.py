@@ -275,8 +275,9 @@ def _cells(line: str, delimiter: str | None) -> list[str]:
 
 
 def _longer(line: str, cells: list[str], delimiter: str | None, count: int) -> str:
-    """Line with further cells; a delimiter at its end is not repeated."""
+    """Line with further cells; a delimiter at its end is not repeated, and empty cells between blanks are `-`."""
     text = io.StringIO()
+    cells = [cell or "-" for cell in cells] if delimiter is None else cells
     csv.writer(text, delimiter=delimiter or " ", lineterminator="").writerow(cells)
     joint = "" if delimiter is not None and len(_cells(line, delimiter)) > count else delimiter or " "
     return f"{line}{joint}{text.getvalue()}"

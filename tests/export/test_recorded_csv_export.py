@@ -87,6 +87,22 @@ def test_a_row_per_image_with_a_time_offset_gets_the_values_of_its_frame(tmp_pat
     assert [row["PSM1.corrected"] for row in rows] == ["1", "0", "1", "1", "1", "0"]
 
 
+def test_blank_separated_tables_keep_their_columns_without_a_verdict(tmp_path):
+    path = tmp_path / "set"
+    write_images(path / "left", FRAMES)
+    names = [f"{arm}_{name}" for arm in ("psm1", "psm2") for name in NAMES]
+    rows = [values_at(number / RATE) + values_at(1 + number / RATE) for number in range(FRAMES)]
+    np.savetxt(path / "joints.txt", rows, header=" ".join(names))
+    data = imported(path, tmp_path / "sequence")
+    header, *lines = (export(data, "recorded-csv", tmp_path / "out") / "joints.txt").read_text().splitlines()
+    columns = header.removeprefix("# ").split()
+    for frame, line in zip(data.frames, lines, strict=True):
+        row = dict(zip(columns, line.split(), strict=True))
+        assert row["PSM1.verdict"] == row["PSM2.verdict"] == (frame.verdict or "-")
+        found = [float(row[f"psm2_{name}.corrected"]) for name in NAMES]
+        np.testing.assert_allclose(found, frame.joint_positions["PSM2"], rtol=0, atol=1e-9)
+
+
 def with_a_log(path: Path) -> Path:
     """As dvrk_data extracts topics: comment lines, nanoseconds, 100 rows a second."""
     write_images(path / "left", FRAMES)
