@@ -282,8 +282,10 @@ def _linear(
     candidates = [(scale, 0.0) for scale in _SCALES]
     lower, upper = limits
     if np.isfinite([lower, upper]).all() and upper > lower:
-        percent = 200.0 / (upper - lower)
-        candidates += [(sign * percent, -sign * percent * (upper + lower) / 2) for sign in (1.0, -1.0)]
+        # Percent of the range: -100 to 100, or 0 to 100 as of LeRobot's grippers.
+        for least in (-100.0, 0.0):
+            percent = (100.0 - least) / (upper - lower)
+            candidates += [(sign * percent, least - percent * lower) for sign in (1.0, -1.0)]
     for scale, offset in candidates:
         rounding = abs(scale) * _ROUNDING + _SINGLE * np.abs(values)
         if (np.abs(scale * positions + offset - values) <= rounding).all():

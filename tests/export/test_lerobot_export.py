@@ -11,6 +11,7 @@ import pytest
 from corrected_frames import corrected
 from lerobot_sets import CAMERAS, JOINTS, LENGTHS, POSES, STATISTICS, dataset
 from recordings import digests, pose_of
+from table_robots import write_table_set
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
@@ -223,6 +224,19 @@ def test_degrees_and_percent_come_back_in_their_units(tmp_path):
     found = np.array(rows[STATE])[2]
     np.testing.assert_allclose(found[[0, 1, 3, 4, 5, 6]], np.degrees(positions[[0, 1, 3, 4, 5, 6]]), rtol=0, atol=1e-9)
     assert found[2] == pytest.approx(-1000 * positions[2], abs=1e-9)
+
+
+def test_motor_positions_of_a_table_robot_come_back_in_percent(tmp_path):
+    made = write_table_set(tmp_path / "made", frames=4)
+    options = ImportOptions(robot={"arm": str(made.urdf)}, angle_unit="percent", flip=("gripper",))
+    sequence = Sequence.open(import_recording(made.folder, tmp_path / "sequence", options)[0])
+    data = Dataset(sequence, tuple(corrected(sequence)), sequence.scene, "regular")
+    rows = episode_rows(export(data, "lerobot", tmp_path / "out"), 0)
+    (arm,) = sequence.scene.arms
+    lower, upper = arm.robot.joint_limits.T
+    expected = np.array([frame.joint_positions["arm"] for frame in data.frames]) * [1, 1, 1, 1, 1, -1]
+    expected = 100 * (expected - lower) / (upper - lower) * [2, 2, 2, 2, 2, 1] - [100, 100, 100, 100, 100, 0]
+    np.testing.assert_allclose(rows[STATE], expected, rtol=0, atol=1e-5)
 
 
 def test_the_command_finds_the_recording_and_refuses_another_one(tmp_path):
