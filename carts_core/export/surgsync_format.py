@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from ..decoders import tables
 from ..errors import SequenceError
-from ..files import OutputPath, write_bytes, write_text
+from ..files import MARKER, OutputPath, write_bytes, write_text
 from ..files.decoding import decoded
 from ..model.psm_kinematics import JOINT_NAMES
 from ..model.scene import Arm
@@ -74,8 +74,10 @@ def write_surgsync(dataset: Dataset, folder: OutputPath, progress: ExportProgres
             results = _arm_results(arm, dataset.frames, found)
             write = _write_packed if is_packed(root) else _write_raw
             written |= write(root, folder, name, dataset, results)
-    parts = [entry.name for entry in sorted(root.iterdir())]
-    copy_files(root, folder, dataset.images, parts=parts, media=_MEDIA, skip=written)
+    # An earlier export's description and masks are not copied.
+    parts = [entry.name for entry in sorted(root.iterdir()) if entry.name not in (MARKER, "rendered")]
+    skip = written | {*(root / "annotation" / "carts_mask").rglob("*")}
+    copy_files(root, folder, dataset.images, parts=parts, media=_MEDIA, skip=skip)
 
 
 def _pose_maps(root: Path, arm: Arm, sequence: Sequence) -> dict[str, PoseMap] | None:

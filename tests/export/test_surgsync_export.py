@@ -95,6 +95,15 @@ def test_masks_match_the_recorded_images(tmp_path, make):
 
 
 @pytest.mark.parametrize("make", [episode, clip])
+def test_an_export_is_imported_and_exported_again(tmp_path, make):
+    out = export(imported(make(tmp_path / "source"), tmp_path / "first"), "surgsync", tmp_path / "out")
+    again = export(imported(out, tmp_path / "second"), "surgsync", tmp_path / "again")
+    assert {file: digest for file, digest in digests(again).items() if file.endswith(".png")} == {
+        file: digest for file, digest in digests(out).items() if file.endswith(".png")
+    }
+
+
+@pytest.mark.parametrize("make", [episode, clip])
 def test_another_recording_is_refused(tmp_path, make):
     path = make(tmp_path / "source")
     data = imported(path, tmp_path / "sequence")
