@@ -299,6 +299,13 @@ def copied(make: Callable[[Path], Path], folder: Path) -> Path:
     return folder / path.relative_to(source)
 
 
+def with_hidden_twins(folder: Path, pattern: str) -> Path:
+    """The folder with a file of macOS, such as `._1.json`, beside each file of a pattern."""
+    for file in [*folder.rglob(pattern)]:
+        (file.parent / f"._{file.name}").write_bytes(b"\x00\x05\x16\x07")
+    return folder
+
+
 def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of every file of a folder."""
     files = [file for file in folder.rglob("*") if file.is_file()]

@@ -30,6 +30,7 @@ from ..recording.sources.lerobot import (
     data_set_root,
     episode_times,
     feature_names,
+    parquet_files,
     read_episode,
     read_info,
     state_table,
@@ -98,7 +99,7 @@ def write_lerobot(dataset: Dataset, folder: OutputPath, progress: ExportProgress
     _collect_masks(results, progress)
     statistics: dict[str, _Sums] = {}
     by_episode: dict[int, dict[str, _Sums]] = {}
-    files = sorted((root / "data").rglob("*.parquet"))
+    files = parquet_files(root / "data")
     for file in files:
         content = _extended(file, results, statistics, by_episode)
         write_bytes(below(folder, root, file), content)

@@ -19,6 +19,7 @@ from ..model.psm_kinematics import JOINT_NAMES
 from ..model.scene import Arm
 from ..package_imports import require_package
 from ..recording import Sequence
+from ..recording.importing.cameras import files_with
 from ..recording.importing.foreign_tables import ForeignTable
 from ..recording.importing.found import Track, read_json, well_formed
 from ..recording.sources.datasets import SURGSYNC, SURGSYNC_ARMS, is_packed, surgsync_tracks
@@ -135,7 +136,7 @@ def _write_raw(root: Path, folder: OutputPath, arm: str, dataset: Dataset, resul
     """Write the JSON files of an arm with `corrected_data` beside `measured_data`; returns the rewritten files."""
     position = {frame.frame_id: row for row, frame in enumerate(dataset.frames)}
     written = set()
-    for file in sorted((root / "kinematic" / arm).glob("*.json")):
+    for file in files_with(root / "kinematic" / arm, (".json",)):
         content = read_json(file)
         with well_formed(f"{file} is not the kinematics of a frame"):
             top = content[0] if isinstance(content, list) else content

@@ -10,7 +10,7 @@ import pyarrow.parquet
 import pytest
 from corrected_frames import corrected
 from lerobot_sets import CAMERAS, JOINTS, LENGTHS, POSES, STATISTICS, dataset
-from recordings import digests, pose_of
+from recordings import digests, pose_of, with_hidden_twins
 from table_robots import write_table_set
 
 from carts_core.cli import main
@@ -172,6 +172,13 @@ def test_episodes_are_exported_one_after_another(tmp_path):
     ]
     np.testing.assert_equal(stats[1], stats[0])
     assert len(rows[STATE]) == LENGTHS[1]
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_hidden_files_of_macos_are_ignored(tmp_path, version):
+    path = with_hidden_twins(dataset(tmp_path / "set", version), "*.parquet")
+    out = export(imported(path, tmp_path / "sequence"), "lerobot", tmp_path / "out")
+    assert episode_rows(out, 0)["carts.corrected"] == [True, False, True, True] and not [*out.rglob("._*")]
 
 
 def test_videos_are_linked_copied_or_left_out(tmp_path):

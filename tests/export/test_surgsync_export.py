@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from corrected_frames import corrected
-from recordings import T_CAMERA_BASE, digests
+from recordings import T_CAMERA_BASE, digests, with_hidden_twins
 from scipy.spatial.transform import Rotation
 from surgsync_recordings import clip, episode
 
@@ -101,6 +101,13 @@ def test_an_export_is_imported_and_exported_again(tmp_path, make):
     assert {file: digest for file, digest in digests(again).items() if file.endswith(".png")} == {
         file: digest for file, digest in digests(out).items() if file.endswith(".png")
     }
+
+
+@pytest.mark.parametrize("make", [episode, clip])
+def test_hidden_files_of_macos_are_ignored(tmp_path, make):
+    path = with_hidden_twins(make(tmp_path / "source"), "*.*")
+    out = export(imported(path, tmp_path / "sequence"), "surgsync", tmp_path / "out")
+    assert find(out).arms and not [*out.rglob("._*")]
 
 
 @pytest.mark.parametrize("make", [episode, clip])

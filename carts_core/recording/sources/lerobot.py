@@ -107,8 +107,7 @@ def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int) -
         videos = {key: (root / f"videos/chunk-{chunk:03d}/{key}/episode_{index:06d}.mp4", 0) for key in cameras}
         return Episode(index, _parquet(old), videos)
     # v3.0: many episodes in one file; meta/episodes has their positions.
-    listed = sorted((root / "meta/episodes").rglob("*.parquet"))
-    for file in listed:
+    for file in parquet_files(root / "meta/episodes"):
         columns = _parquet(file).columns
         for number in np.flatnonzero(columns.get("episode_index", np.empty(0)) == index)[:1]:
             row = {name: values[number] for name, values in columns.items()}
@@ -136,6 +135,11 @@ def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index:
 def _parquet(path: Path) -> ForeignTable:
     with well_formed(f"table {path} cannot be read"):
         return ForeignTable(path, read_parquet(path))
+
+
+def parquet_files(folder: Path) -> list[Path]:
+    """Parquet files below a folder by name, without hidden files (such as `._file-000.parquet` of macOS)."""
+    return sorted(file for file in folder.rglob("*.parquet") if not file.name.startswith("."))
 
 
 def feature_names(value: Any) -> list[str]:
