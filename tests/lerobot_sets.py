@@ -10,7 +10,7 @@ import pyarrow.parquet
 from recordings import image, jaw_at, joints_at, pose_of
 from videos import write_video
 
-from carts_core.model.psm_kinematics import forward
+from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 
 FRAMES = 6
 LENGTHS = (4, FRAMES)
@@ -142,3 +142,21 @@ def dataset(folder: Path, version: str = "v2.1", names: list[str] = POSES, kind:
         episodes[f"videos/{key}/to_timestamp"] = [end / 30 for end in starts[1:]]
     write_parquet(folder / "meta/episodes/chunk-000/file-000.parquet", episodes)
     return folder
+
+
+def with_states(folder: Path, names: object, rows: list[list[float]]) -> Path:
+    """The data set (v2.1) with other states of its first episode."""
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"]["observation.state"] |= {"shape": [len(rows[0])], "names": names}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    file = folder / "data/chunk-000/episode_000000.parquet"
+    table = pyarrow.parquet.read_table(file).drop_columns(["observation.state"])
+    write_parquet(file, {"observation.state": rows, **table.to_pydict()})
+    return folder
+
+
+def two_arms(folder: Path) -> Path:
+    """A data set (v2.1) whose state has the same joint names under the keys of two arms."""
+    joints = [*JOINT_NAMES, "jaw"]
+    rows = [[*joints_at(n / 30), 0.1, *joints_at(1 + n / 30), 0.2] for n in range(LENGTHS[0])]
+    return with_states(dataset(folder), {"psm1": joints, "psm2": joints}, rows)

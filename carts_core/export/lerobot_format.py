@@ -22,14 +22,13 @@ from ..files.decoding import Limits, called
 from ..files.reading import VALUES, is_regular, parse_json, read_text
 from ..package_imports import require_package
 from ..recording.images import decode_image
-from ..recording.importing.foreign_tables import read_parquet
+from ..recording.importing.foreign_tables import ForeignTable, read_parquet
 from ..recording.importing.found import Import, well_formed
 from ..recording.sources.lerobot import (
     STATE,
     Episode,
     data_set_root,
     episode_times,
-    feature_names,
     parquet_files,
     read_episode,
     read_info,
@@ -41,7 +40,15 @@ from .dataset import Dataset, ExportProgress
 from .encodings import image_png
 from .kinematics import joint_columns, position_values, std_values
 from .recording_copy import below, copy_files
-from .source_tables import ColumnMaps, as_imported, column_maps, frame_positions, rows_of_frames, source_of
+from .source_tables import (
+    ColumnMaps,
+    as_imported,
+    column_maps,
+    column_meanings,
+    frame_positions,
+    rows_of_frames,
+    source_of,
+)
 
 CORRECTED_STATE = "observation.state_corrected"
 POSITIONS, STD = "carts.joint_positions", "carts.joint_std"
@@ -77,10 +84,17 @@ class _Results:
     dataset: Dataset
     episode: Episode
     rows: Int[ndarray, " frames"]
-    maps: ColumnMaps
-    state_names: list[str]
+    state: ForeignTable
+    """State of the episode by names."""
     state_type: str
+    maps: dict[str, ColumnMaps]
+    """Arm -> conversions to columns of the state."""
     masks: list[_Masks]
+
+    @property
+    def meanings(self) -> dict[str, str]:
+        """Column of the state -> `ARM.JOINT`, or `ARM.tip.COMPONENT`."""
+        return {column: meaning for maps in self.maps.values() for column, meaning in maps.meanings.items()}
 
 
 def write_lerobot(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
@@ -122,7 +136,13 @@ def _results(
     times = episode_times(episode, rate, Import(ImportOptions()))
     rows = rows_of_frames(sequence, len(episode.table), times, where)
     state = state_table(root, features, episode)
-    maps = column_maps(state, sequence, rows, where)
+    meanings = column_meanings(state, sequence)
+    maps = column_maps(state, meanings, sequence, lambda arm, _: (rows, sequence.measured[arm]))
+    if meanings.arms and not maps:
+        raise SequenceError(
+            f"the joint positions of {sequence.path} are not those of {where}. Give the recording from which the "
+            "sequence was imported: --recording PATH."
+        )
     masks = []
     for camera in dataset.scene.cameras:
         size = camera.height, camera.width
@@ -130,7 +150,7 @@ def _results(
         masks.append(_Masks(f"{key}_mask", size, [_mask_file(np.zeros(size, bool))], [0.0]))
     kind = str(features[STATE].get("dtype", "float32"))
     kind = kind if kind in ("float32", "float64") else "float32"
-    return _Results(dataset, episode, rows, maps, feature_names(features[STATE].get("names")), kind, masks)
+    return _Results(dataset, episode, rows, state, kind, maps, masks)
 
 
 def _video_feature(dataset: Dataset, camera: str, episode: Episode) -> str | None:
@@ -211,7 +231,7 @@ def _columns(
         corrected[row] = frame.source != "measured"
         sources[row], verdicts[row] = frame.source, frame.verdict or ""
     found: dict[str, list[Any]] = {}
-    if results.maps.meanings:
+    if results.maps:
         found[CORRECTED_STATE] = ["numbers", _state(recorded, own, results).astype(results.state_type)]
     found |= {POSITIONS: ["numbers", positions], STD: ["numbers", std], CORRECTED: ["numbers", corrected]}
     for name, texts in ((SOURCE, sources), (VERDICT, verdicts)):
@@ -235,10 +255,12 @@ def _state(
         raise ValueError(f"{CORRECTED_STATE} has the shape {found.shape}, and {STATE} {state.shape}")
     if len(own):
         found[own] = state[own]
-        columns = {name: state[own, number] for number, name in enumerate(results.state_names)}
-        corrected = results.maps.corrected(columns, *frame_positions(results.dataset), results.rows)
-        for name, values in corrected.items():
-            found[own, results.state_names.index(name)] = values
+        positions, changed = frame_positions(results.dataset)
+        names = list(results.state.columns)
+        for arm, maps in results.maps.items():
+            rows = own[maps.rows[changed]]
+            for name, values in maps.columns(positions[arm], results.state).items():
+                found[rows, names.index(name)] = values[changed]
     return found
 
 
@@ -336,8 +358,8 @@ def _features(results: _Results) -> dict[str, dict[str, Any]]:
     """Descriptions of the new features for `meta/info.json`."""
     columns = joint_columns(results.dataset.scene)
     found: dict[str, dict[str, Any]] = {}
-    if results.maps.meanings:
-        names = results.state_names
+    if results.maps:
+        names = list(results.state.columns)
         found[CORRECTED_STATE] = {"dtype": results.state_type, "shape": [len(names)], "names": names}
     for name in (POSITIONS, STD):
         found[name] = {"dtype": "float64", "shape": [len(columns)], "names": columns}
@@ -351,11 +373,11 @@ def _features(results: _Results) -> dict[str, dict[str, Any]]:
 
 def _description(results: _Results) -> str:
     """Origin of the results and meaning of the state's columns, as JSON."""
-    meanings = results.maps.meanings
+    meanings = results.meanings
     content = {
         "sequence": results.dataset.sequence.name,
         "episode_index": results.episode.index,
-        "corrected_columns": {name: meanings[name] for name in results.state_names if name in meanings},
-        "recorded_columns": [name for name in results.state_names if name not in meanings],
+        "corrected_columns": {name: meanings[name] for name in results.state.columns if name in meanings},
+        "recorded_columns": [name for name in results.state.columns if name not in meanings],
     }
     return json.dumps(content, indent=1, ensure_ascii=False)

@@ -7,6 +7,7 @@ with more rows than images, the corrections of consecutive frames are interpolat
 import csv
 import io
 from collections.abc import Mapping
+from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +18,8 @@ from numpy import ndarray
 from ..errors import SequenceError
 from ..files import OutputPath, write_bytes, write_text
 from ..files.reading import TABLE, read_text
-from ..model.psm_kinematics import JOINT_NAMES
-from ..model.scene import Arm
 from ..recording import Sequence
-from ..recording.importing.columns import ColumnMeanings, arm_in, guess_columns
+from ..recording.importing.columns import ColumnMeanings
 from ..recording.importing.foreign_tables import DECIMAL_COMMAS, ForeignTable, delimiter_of, read_foreign_table
 from ..recording.importing.found import Import
 from ..recording.importing.row_matching import row_seconds
@@ -30,7 +29,7 @@ from ..settings.interchange import ImportOptions
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .encodings import mask_png
 from .recording_copy import below
-from .source_tables import POSE, JointMap, PoseMap, frame_positions, joint_maps, pose_map, source_of
+from .source_tables import ColumnMaps, column_maps, column_meanings, frame_positions, source_of
 
 _SUFFIXES = (".csv", ".tsv", ".txt")
 _SAME_CLOCK = 1e-5
@@ -86,60 +85,35 @@ def write_recorded_csv(dataset: Dataset, folder: OutputPath, progress: ExportPro
 
 def _new_columns(table: ForeignTable, dataset: Dataset, sequence: Sequence) -> dict[str, list[str]]:
     """New columns of a table as text; empty if none of its rows are those of an arm of the sequence."""
-    arms = {arm.name: arm for arm in sequence.scene.arms}
-    others = {
-        name: str(arm.robot.urdf) for name, arm in arms.items() if not set(JOINT_NAMES) <= set(arm.robot.joint_names)
-    }
-    meanings = guess_columns(table, ImportOptions(robot=others))
+    meanings = column_meanings(table, sequence)
+
+    def rows_of(arm: str, names: Items[str]) -> tuple[Int[ndarray, " logged"], Float[ndarray, "logged dofs"]] | None:
+        times, values = sequence.logged_rows(arm)
+        rows = _rows(table, meanings, names, times, len(values), sequence)
+        return None if rows is None else (rows, values)
+
     columns: dict[str, list[str]] = {}
-    for recorded, named in meanings.arms.items():
-        name = recorded or arm_in(table.path.stem) or "PSM1"
-        if name not in arms and len(arms) == 1:
-            (name,) = arms
-        if name in arms:
-            columns |= _arm_columns(table, meanings, named, arms[name], dataset, sequence)
+    for arm, maps in column_maps(table, meanings, sequence, rows_of).items():
+        times, values = sequence.logged_rows(arm)
+        if times is None or _is_row_per_frame(times + sequence.arm_time_offsets[arm], sequence.timestamps):
+            results = _by_row(dataset, arm)
+        else:
+            results = _by_time(dataset, arm, times, values)
+        columns |= _texts(table, maps, results, dataset.frames)
     return columns
-
-
-def _arm_columns(
-    table: ForeignTable,
-    meanings: ColumnMeanings,
-    named: Mapping[str, str],
-    arm: Arm,
-    dataset: Dataset,
-    sequence: Sequence,
-) -> dict[str, list[str]]:
-    """New columns of an arm, by name; empty if the rows are not those of the sequence."""
-    times, values = sequence.logged_rows(arm.name)
-    rows = _rows(table, meanings, named, times, len(values), sequence)
-    if rows is None:
-        return {}
-    joints = joint_maps(arm.name, arm.robot, named, table, values, rows)
-    pose: PoseMap | None = None
-    if set(POSE) <= set(named) and set(JOINT_NAMES) <= set(arm.robot.joint_names):
-        places = tuple(named[part] for part in POSE)
-        recorded = np.stack([table.numbers(column).astype(np.float64)[rows] for column in places], 1)
-        pose = pose_map(arm.name, arm.robot, places, recorded, values)
-    if not joints and pose is None:
-        return {}
-    if times is None or _is_row_per_frame(times + sequence.arm_time_offsets[arm.name], sequence.timestamps):
-        results = _by_row(dataset, arm.name)
-    else:
-        results = _by_time(dataset, arm.name, times, values)
-    decimal = "," if DECIMAL_COMMAS in table.remarks else "."
-    return _texts(table, arm.name, rows, results, joints, pose, dataset.frames, decimal)
 
 
 def _rows(
     table: ForeignTable,
     meanings: ColumnMeanings,
-    named: Mapping[str, str],
+    names: Items[str],
     times: Float[ndarray, " logged"] | None,
     count: int,
     sequence: Sequence,
 ) -> Int[ndarray, " logged"] | None:
-    """Row of the table for each logged row of the sequence; None if they do not correspond."""
-    numbers = np.stack([table.numbers(column).astype(np.float64) for column in named.values()], 1)
+    """Row of the table for each logged row of the sequence, among rows with values in the named columns; None if they
+    do not correspond."""
+    numbers = np.stack([table.numbers(name).astype(np.float64) for name in names], 1)
     used = np.asarray(np.isfinite(numbers).all(1))
     if times is not None and meanings.time is not None:
         seconds = row_seconds(table, meanings.time, None, Import(ImportOptions()))
@@ -209,36 +183,26 @@ def _by_time(
 
 
 def _texts(
-    table: ForeignTable,
-    arm: str,
-    rows: Int[ndarray, " logged"],
-    results: _RowResults,
-    joints: list[JointMap],
-    pose: PoseMap | None,
-    frames: tuple[ExportFrame, ...],
-    decimal: str,
+    table: ForeignTable, maps: ColumnMaps, results: _RowResults, frames: tuple[ExportFrame, ...]
 ) -> dict[str, list[str]]:
     """New columns as text; rows without results keep their recorded values."""
     columns: dict[str, Float[ndarray, " logged"]] = {}
-    for joint in joints:
-        columns[f"{joint.column}.corrected"] = joint.scale * results.positions[:, joint.index] + joint.offset
-        columns[f"{joint.column}.std"] = abs(joint.scale) * results.std[:, joint.index]
-    if pose is not None:
-        values = pose.poses(results.positions[:, pose.joints])
-        old = np.stack([table.numbers(name).astype(np.float64)[rows] for name in pose.columns[3:]], 1)
-        values[:, 3:] *= np.where((values[:, 3:] * old).sum(1) < 0, -1.0, 1.0)[:, None]
-        columns |= {f"{name}.corrected": value for name, value in zip(pose.columns, values.T, strict=True)}
+    std = {joint.column: abs(joint.scale) * results.std[:, joint.index] for joint in maps.joints}
+    for name, values in maps.columns(results.positions, table).items():
+        columns[f"{name}.corrected"] = values
+        columns |= {f"{name}.std": std[name]} if name in std else {}
+    decimal, rows = "," if DECIMAL_COMMAS in table.remarks else ".", maps.rows.tolist()
     found = {}
     for name, values in columns.items():
         texts = [repr(float(value)) for value in _recorded(table, name.removesuffix(".corrected"))]
-        for row, value, changed in zip(rows.tolist(), values.tolist(), results.changed.tolist(), strict=True):
+        for row, value, changed in zip(rows, values.tolist(), results.changed.tolist(), strict=True):
             texts[row] = repr(value) if changed else texts[row]
         found[name] = [text.replace(".", decimal) for text in texts]
     marks, verdicts = ["0"] * len(table), [""] * len(table)
-    for row, number in zip(rows.tolist(), results.frames.tolist(), strict=True):
+    for row, number in zip(rows, results.frames.tolist(), strict=True):
         if number >= 0:
             marks[row], verdicts[row] = "1", frames[number].verdict or ""
-    return {**found, f"{arm}.corrected": marks, f"{arm}.verdict": verdicts}
+    return {**found, f"{maps.arm}.corrected": marks, f"{maps.arm}.verdict": verdicts}
 
 
 def _recorded(table: ForeignTable, column: str) -> Float[ndarray, " rows"]:

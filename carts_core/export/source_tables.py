@@ -6,9 +6,11 @@ offset`, and the tip poses of an arm are T_reference_base T_base_tip(joint posit
 columns are not related to the sequence in this way is another recording, and is refused.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,7 +21,7 @@ from ..errors import SequenceError
 from ..model.psm_kinematics import JOINT_NAMES, PsmGeometry, forward
 from ..model.robot import Robot
 from ..recording import Sequence as Recording
-from ..recording.importing.columns import ColumnMeanings, guess_columns
+from ..recording.importing.columns import ColumnMeanings, arm_in, guess_columns
 from ..recording.importing.foreign_tables import ForeignTable
 from ..recording.importing.found import PartError
 from ..recording.importing.logs import ACCEPTED, CANDIDATES, fit_base_frame, fit_tool_point, transforms
@@ -126,7 +128,6 @@ def frame_positions(
 class JointMap:
     """Conversion of one joint: column = scale * position + offset."""
 
-    arm: str
     joint: str
     index: int
     """Index of the joint in `Robot.joint_names`."""
@@ -139,7 +140,6 @@ class JointMap:
 class PoseMap:
     """Conversion of the joint positions of a PSM to tip poses."""
 
-    arm: str
     joints: tuple[int, ...]
     """Indices of the six joints of the PSM in `Robot.joint_names`."""
     columns: tuple[str, ...]
@@ -158,103 +158,130 @@ class PoseMap:
 
 @dataclass(frozen=True, eq=False)
 class ColumnMaps:
-    """Conversions of the columns of a table."""
+    """Conversions of the joint positions of an arm to columns of a table."""
 
-    joints: tuple[JointMap, ...] = ()
-    poses: tuple[PoseMap, ...] = ()
+    arm: str
+    rows: Int[ndarray, " n"]
+    """Row of each frame, or of each logged row of the sequence."""
+    joints: tuple[JointMap, ...]
+    pose: PoseMap | None
 
     @property
     def meanings(self) -> dict[str, str]:
         """Column -> `ARM.JOINT`, or `ARM.tip.COMPONENT`."""
-        tips = {c: f"{one.arm}.tip.{part}" for one in self.poses for c, part in zip(one.columns, POSE, strict=True)}
-        return {**{one.column: f"{one.arm}.{one.joint}" for one in self.joints}, **tips}
+        tip = {} if self.pose is None else dict(zip(self.pose.columns, POSE, strict=True))
+        joints = {one.column: f"{self.arm}.{one.joint}" for one in self.joints}
+        return {**joints, **{column: f"{self.arm}.tip.{part}" for column, part in tip.items()}}
 
-    def corrected(
-        self,
-        columns: Mapping[str, Float[ndarray, " rows"]],
-        positions: Mapping[str, Float[ndarray, "frames dofs"]],
-        changed: Bool[ndarray, " frames"],
-        rows: Int[ndarray, " frames"],
-    ) -> dict[str, Float[ndarray, " rows"]]:
-        """Columns with the values of the changed frames; recorded values remain in other rows.
-
-        Args:
-            columns: the recorded columns.
-            positions: arm -> joint positions of all frames [rad, m].
-            changed: frames whose positions replace those of their rows.
-            rows: row of each frame.
-        """
-        found = {name: np.asarray(columns[name], np.float64).copy() for name in self.meanings}
-        for joint in self.joints:
-            values = joint.scale * positions[joint.arm][:, joint.index] + joint.offset
-            found[joint.column][rows[changed]] = values[changed]
-        for pose in self.poses:
-            values = pose.poses(positions[pose.arm][:, pose.joints])
-            recorded = np.stack([columns[name][rows] for name in pose.columns[3:]], 1)
-            # A quaternion and its negative are the same rotation; the recorded sign is kept.
+    def columns(self, positions: Float[ndarray, "n dofs"], table: ForeignTable) -> dict[str, Float[ndarray, " n"]]:
+        """Columns at joint positions [rad, m] of `rows`; quaternions have the signs of those in the table, since a
+        quaternion and its negative are the same rotation."""
+        found = {one.column: one.scale * positions[:, one.index] + one.offset for one in self.joints}
+        if self.pose is not None:
+            values = self.pose.poses(positions[:, self.pose.joints])
+            recorded = np.stack([table.numbers(name)[self.rows] for name in self.pose.columns[3:]], 1)
             values[:, 3:] *= np.where((values[:, 3:] * recorded).sum(1) < 0, -1.0, 1.0)[:, None]
-            for name, corrected in zip(pose.columns, values.T, strict=True):
-                found[name][rows[changed]] = corrected[changed]
+            found |= dict(zip(self.pose.columns, values.T, strict=True))
         return found
 
 
-def column_maps(table: ForeignTable, sequence: Recording, rows: Int[ndarray, " frames"], where: object) -> ColumnMaps:
-    """Identify the columns of a table by their names and values.
+T = TypeVar("T")
+
+
+def matched_arms(
+    arms: Iterable[str], recorded: Iterable[str], fit: Callable[[str, str], T | None]
+) -> dict[str, tuple[str, T]]:
+    """Recorded arm of each arm, which may have another name, and its fit.
 
     Args:
-        table: table with a row per image.
-        sequence: the sequence `as_imported`.
-        rows: row of each frame of the sequence.
-        where: the recording, for errors.
-
-    Returns:
-        The conversions; without any if no column is recognized by its name.
-
-    Raises:
-        SequenceError: columns are recognized, but their values are not those of the sequence.
+        arms: arms of the sequence.
+        recorded: arms of the recording.
+        fit: compares the values of an arm and a recorded arm; None if they differ. Equal names are compared first.
     """
-    arms = {arm.name: arm for arm in sequence.scene.arms}
-    others = {
-        name: str(arm.robot.urdf) for name, arm in arms.items() if not set(JOINT_NAMES) <= set(arm.robot.joint_names)
+    found: dict[str, tuple[str, T]] = {}
+    for arm, name in sorted(product(arms, recorded), key=lambda pair: pair[0] != pair[1]):
+        if arm not in found and name not in {other for other, _ in found.values()}:
+            fitting = fit(arm, name)
+            if fitting is not None:
+                found[arm] = name, fitting
+    return found
+
+
+def column_meanings(table: ForeignTable, sequence: Recording) -> ColumnMeanings:
+    """Meanings of the columns of a table by their names; without arms if none is recognized."""
+    robots = {
+        arm.name: str(arm.robot.urdf)
+        for arm in sequence.scene.arms
+        if not set(JOINT_NAMES) <= set(arm.robot.joint_names)
     }
     try:
-        meanings = guess_columns(table, ImportOptions(robot=others))
+        return guess_columns(table, ImportOptions(robot=robots))
     except PartError:
-        return ColumnMaps()
-    joints: list[JointMap] = []
-    poses: list[PoseMap] = []
-    for recorded, columns in meanings.arms.items():
-        name = recorded or "PSM1"
-        if name not in arms and len(arms) == len(meanings.arms) == 1:
-            (name,) = arms
-        if name in arms:
-            measured = sequence.measured[name]
-            joints += joint_maps(name, arms[name].robot, columns, table, measured, rows)
-            if set(POSE) <= set(columns) and set(JOINT_NAMES) <= set(arms[name].robot.joint_names):
-                places = tuple(columns[part] for part in POSE)
-                values = np.stack([table.numbers(column).astype(np.float64)[rows] for column in places], 1)
-                found = pose_map(name, arms[name].robot, places, values, measured)
-                poses += [] if found is None else [found]
-    if not joints and not poses and _named(meanings, arms):
-        raise SequenceError(
-            f"the joint positions of {sequence.path} are not those of {where}. Give the recording from which the "
-            "sequence was imported: --recording PATH."
-        )
-    return ColumnMaps(tuple(joints), tuple(poses))
+        return replace(guess_columns(table, ImportOptions()), arms={})
 
 
-def _named(meanings: ColumnMeanings, arms: Mapping[str, object]) -> bool:
-    """Whether a table has columns of an arm of the sequence."""
-    return any((name or "PSM1") in arms for name in meanings.arms) or len(meanings.arms) == len(arms) == 1
+def column_maps(
+    table: ForeignTable,
+    meanings: ColumnMeanings,
+    sequence: Recording,
+    rows_of: Callable[[str, Sequence[str]], tuple[Int[ndarray, " n"], Float[ndarray, "n dofs"]] | None],
+) -> dict[str, ColumnMaps]:
+    """Identify the columns of the arms of a sequence by names and values, else by values alone.
+
+    An import may rename arms and choose columns, so names may differ.
+
+    Args:
+        rows_of: returns, for an arm and the columns that an import would use, the rows with values and the imported
+            joint positions of the arm in these rows [rad, m]; None if their numbers differ.
+
+    Returns:
+        Arm -> conversions, for the arms whose values are in the table.
+    """
+    arms = {arm.name: arm for arm in sequence.scene.arms}
+    recorded = {name or arm_in(table.path.stem) or "PSM1": columns for name, columns in meanings.arms.items()}
+
+    def by_name(arm: str, name: str) -> ColumnMaps | None:
+        columns, robot = recorded[name], arms[arm].robot
+        joints = [joint for joint in robot.joint_names if joint in columns]
+        has_pose = set(POSE) <= set(columns) and set(JOINT_NAMES) <= set(robot.joint_names)
+        used = POSE if has_pose and not set(JOINT_NAMES) <= set(columns) else joints
+        if not used or (found := rows_of(arm, [columns[part] for part in used])) is None:
+            return None
+        rows, values = found
+        joint_columns, pose = joint_maps(robot, columns, table, values, rows), None
+        if has_pose:
+            places = tuple(columns[part] for part in POSE)
+            poses = np.stack([table.numbers(column).astype(np.float64)[rows] for column in places], 1)
+            pose = pose_map(robot, places, poses, values)
+        # A jaw does not identify an arm of another name.
+        identified = pose is not None or any(arm == name or one.joint != "jaw" for one in joint_columns)
+        return ColumnMaps(arm, rows, tuple(joint_columns), pose) if identified else None
+
+    def by_value(arm: str) -> ColumnMaps | None:
+        if not numeric or (found := rows_of(arm, numeric)) is None:
+            return None
+        rows, values = found
+        wanted, columns = sequence.measured_joints[arm], {}
+        for joint in wanted:
+            fitting = [one for one in numeric if joint_maps(arms[arm].robot, {joint: one}, table, values, rows)]
+            columns |= {joint: fitting[0]} if len(fitting) == 1 else {}
+        # Joints that do not move may fit several columns, or share one.
+        if not {*wanted} - {"jaw"} <= columns.keys() or len({*columns.values()}) < len(columns):
+            return None
+        return ColumnMaps(arm, rows, tuple(joint_maps(arms[arm].robot, columns, table, values, rows)), None)
+
+    found = {arm: maps for arm, (_, maps) in matched_arms(arms, recorded, by_name).items()}
+    taken = {column for maps in found.values() for column in maps.meanings}
+    numeric = [name for name, values in table.columns.items() if values.dtype.kind in "iuf" and name not in taken]
+    return found | {arm: maps for arm in arms if arm not in found and (maps := by_value(arm)) is not None}
 
 
 def joint_maps(
-    arm: str,
     robot: Robot,
     columns: Mapping[str, str],
     table: ForeignTable,
-    measured: Float[ndarray, "frames dofs"],
-    rows: Int[ndarray, " frames"],
+    measured: Float[ndarray, "n dofs"],
+    rows: Int[ndarray, " n"],
 ) -> list[JointMap]:
     """Conversions of the joints of an arm (joint -> column) whose values fit; empty unless those of all joints but the
     jaw fit."""
@@ -269,7 +296,7 @@ def joint_maps(
         limits = robot.joint_limits[index].tolist()
         fit = _linear(values[used], positions[used], limits)
         if fit is not None:
-            found.append(JointMap(arm, name, index, columns[name], *fit))
+            found.append(JointMap(name, index, columns[name], *fit))
         elif name != "jaw":
             return []
     return found
@@ -294,7 +321,6 @@ def _linear(
 
 
 def pose_map(
-    arm: str,
     robot: Robot,
     columns: tuple[str, ...],
     values: Float[ndarray, "frames 7"],
@@ -327,7 +353,7 @@ def pose_map(
                 if fit.deviation < deviation:
                     T = fit.T_reference_base
                     T = np.eye(4) if np.abs(T - np.eye(4)).max() < _IDENTITY else T
-                    best = PoseMap(arm, indices, columns, geometry, T, T_tip_point, 1.0 / unit)
+                    best = PoseMap(indices, columns, geometry, T, T_tip_point, 1.0 / unit)
                     deviation = 0.5 * fit.deviation
         if best is not None:
             return best

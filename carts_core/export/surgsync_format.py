@@ -16,6 +16,7 @@ from ..errors import SequenceError
 from ..files import MARKER, OutputPath, write_bytes, write_text
 from ..files.decoding import decoded
 from ..model.psm_kinematics import JOINT_NAMES
+from ..model.robot import Robot
 from ..model.scene import Arm
 from ..package_imports import require_package
 from ..recording import Sequence
@@ -26,7 +27,7 @@ from ..recording.sources.datasets import SURGSYNC, SURGSYNC_ARMS, is_packed, sur
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .encodings import mask_png
 from .recording_copy import below, copy_files
-from .source_tables import POSE, PoseMap, as_imported, joint_maps, pose_map, rows_of_frames, source_of
+from .source_tables import POSE, PoseMap, as_imported, joint_maps, matched_arms, pose_map, rows_of_frames, source_of
 
 _MEDIA = ("image", "video_raw", "video")
 _POSES = {"poses": "corrected_cp", "local_poses": "local_corrected_cp"}
@@ -58,55 +59,58 @@ def write_surgsync(dataset: Dataset, folder: OutputPath, progress: ExportProgres
     if is_packed(root):
         require_package("pyarrow", "import")
     sequence = as_imported(dataset.sequence)
-    arms = {arm.name: arm for arm in dataset.scene.arms if arm.name in SURGSYNC_ARMS}
-    maps = {name: _pose_maps(root, arm, sequence) for name, arm in arms.items()}
-    if not any(found is not None for found in maps.values()):
+    arms = {arm.name: arm for arm in dataset.scene.arms if set(JOINT_NAMES) <= set(arm.robot.joint_names)}
+    recorded = _series(root, sequence)
+    found = matched_arms(
+        arms, recorded, lambda arm, name: _pose_maps(recorded[name], arms[arm].robot, sequence.measured[arm])
+    )
+    if not found:
         raise SequenceError(
             f"the joint positions of {sequence.path} are not those of {root}. Give the recording from which the "
             "sequence was imported: --recording PATH."
         )
     for view in dataset.views(progress):
-        recorded = dataset.sequence.recorded_camera(view.camera.name)
-        target = folder / "annotation" / "carts_mask" / view.camera.name / f"{view.frame.frame_id}.png"
-        write_bytes(target, mask_png(recorded.distorted_mask(view.link_ids >= 0)))
+        camera = dataset.sequence.recorded_camera(view.camera.name)
+        target = folder / "annotation" / "carts_mask" / camera.name / f"{view.frame.frame_id}.png"
+        write_bytes(target, mask_png(camera.distorted_mask(view.link_ids >= 0)))
     written: set[Path] = set()
-    for name, arm in arms.items():
-        if (found := maps[name]) is not None:
-            results = _arm_results(arm, dataset.frames, found)
-            write = _write_packed if is_packed(root) else _write_raw
-            written |= write(root, folder, name, dataset, results)
+    write = _write_packed if is_packed(root) else _write_raw
+    for arm, (name, maps) in found.items():
+        written |= write(root, folder, name, dataset, _arm_results(arms[arm], dataset.frames, maps))
     # An earlier export's description and masks are not copied.
     parts = [entry.name for entry in sorted(root.iterdir()) if entry.name not in (MARKER, "rendered")]
     skip = written | {*(root / "annotation" / "carts_mask").rglob("*")}
     copy_files(root, folder, dataset.images, parts=parts, media=_MEDIA, skip=skip)
 
 
-def _pose_maps(root: Path, arm: Arm, sequence: Sequence) -> dict[str, PoseMap] | None:
-    """Conversions from joint positions to the recorded poses of an arm; None if its recorded values are not those of
-    the sequence."""
-    tracks = surgsync_tracks(root, arm.name, sequence.frame_ids)
-    count = len(sequence)
+def _series(root: Path, sequence: Sequence) -> dict[str, dict[str, Float[ndarray, "frames n"]]]:
+    """Recorded arm -> role, as in `surgsync_tracks` -> values in the frames of the sequence."""
+    tracks = {
+        arm: {
+            role: track for role, track in surgsync_tracks(root, arm, sequence.frame_ids).items() if track is not None
+        }
+        for arm in SURGSYNC_ARMS
+    }
+    rows = np.arange(len(sequence))
     if is_packed(root):
-        last = max((int(track.times[-1]) for track in tracks.values() if track is not None), default=-1)
+        last = max((int(track.times[-1]) for series in tracks.values() for track in series.values()), default=-1)
         rows = rows_of_frames(sequence, last + 1, None, root)
-    else:
-        rows = np.arange(count)
-    measured = sequence.measured[arm.name]
-    series = {role: _at_rows(track, rows) for role, track in tracks.items() if track is not None}
-    names = [*JOINT_NAMES, "jaw"]
-    values = [*series.get("joints", np.full((count, 6), np.nan)).T, *series.get("jaw", np.full((count, 1), np.nan)).T]
-    known = np.isfinite(np.stack(values[:6])).all(0) & np.isfinite(measured).all(1)
-    fitting = False
-    if known.any():
-        table = ForeignTable(root, {name: column[known] for name, column in zip(names, values, strict=True)})
+    return {arm: {role: _at_rows(track, rows) for role, track in series.items()} for arm, series in tracks.items()}
+
+
+def _pose_maps(
+    series: Mapping[str, Float[ndarray, "frames n"]], robot: Robot, measured: Float[ndarray, "frames dofs"]
+) -> dict[str, PoseMap] | None:
+    """Conversions from joint positions to the recorded poses of an arm; None if its recorded values are not the
+    measured joint positions [rad, m]."""
+    if (joints := series.get("joints")) is not None:
+        table = ForeignTable(Path(), dict(zip(JOINT_NAMES, joints.T, strict=True)))
         columns = {name: name for name in JOINT_NAMES}
-        fitting = bool(joint_maps(arm.name, arm.robot, columns, table, measured[known], np.arange(int(known.sum()))))
-    found = {}
-    for role, name in _POSES.items():
-        if role in series:
-            fit = pose_map(arm.name, arm.robot, POSE, series[role], measured)
-            found |= {} if fit is None else {name: fit}
-    return found if fitting or (found and "joints" not in series) else None
+        if not joint_maps(robot, columns, table, measured, np.arange(len(measured))):
+            return None
+    fits = {name: pose_map(robot, POSE, series[role], measured) for role, name in _POSES.items() if role in series}
+    found = {name: fit for name, fit in fits.items() if fit is not None}
+    return found if found or joints is not None else None
 
 
 def _at_rows(track: Track, rows: Int[ndarray, " frames"]) -> Float[ndarray, "frames n"]:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from corrected_frames import corrected
-from lerobot_sets import CAMERAS, JOINTS, LENGTHS, POSES, STATISTICS, dataset
+from lerobot_sets import CAMERAS, JOINTS, LENGTHS, POSES, STATISTICS, dataset, states, two_arms, with_states
 from recordings import digests, pose_of, with_hidden_twins
 from table_robots import write_table_set
 
@@ -17,7 +17,7 @@ from carts_core.cli import main
 from carts_core.errors import CartsError
 from carts_core.export import Dataset, ExportProgress, export, formats_of, kinematics_csv, measured_frames
 from carts_core.export.kinematics import joint_columns
-from carts_core.model.psm_kinematics import forward
+from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import import_recording
 from carts_core.recording.sequence_file import calibrated_sequence_file
@@ -27,8 +27,8 @@ STATE = "observation.state_corrected"
 MASK = "observation.images.endoscope.left_mask"
 
 
-def imported(path: Path, folder: Path) -> Dataset:
-    sequence = Sequence.open(import_recording(path, folder)[0])
+def imported(path: Path, folder: Path, options: ImportOptions | None = None) -> Dataset:
+    sequence = Sequence.open(import_recording(path, folder, options)[0])
     return Dataset(sequence, tuple(corrected(sequence)), sequence.scene, "regular")
 
 
@@ -236,14 +236,34 @@ def test_degrees_and_percent_come_back_in_their_units(tmp_path):
 def test_motor_positions_of_a_table_robot_come_back_in_percent(tmp_path):
     made = write_table_set(tmp_path / "made", frames=4)
     options = ImportOptions(robot={"arm": str(made.urdf)}, angle_unit="percent", flip=("gripper",))
-    sequence = Sequence.open(import_recording(made.folder, tmp_path / "sequence", options)[0])
-    data = Dataset(sequence, tuple(corrected(sequence)), sequence.scene, "regular")
+    data = imported(made.folder, tmp_path / "sequence", options)
     rows = episode_rows(export(data, "lerobot", tmp_path / "out"), 0)
-    (arm,) = sequence.scene.arms
+    (arm,) = data.scene.arms
     lower, upper = arm.robot.joint_limits.T
     expected = np.array([frame.joint_positions["arm"] for frame in data.frames]) * [1, 1, 1, 1, 1, -1]
     expected = 100 * (expected - lower) / (upper - lower) * [2, 2, 2, 2, 2, 1] - [100, 100, 100, 100, 100, 0]
     np.testing.assert_allclose(rows[STATE], expected, rtol=0, atol=1e-5)
+
+
+def assert_state(data: Dataset, folder: Path, arms: list[str]) -> None:
+    """The corrected state consists of the joint positions of the arms."""
+    state = episode_rows(export(data, "lerobot", folder), 0)[STATE]
+    expected = [np.concatenate([frame.joint_positions[arm] for arm in arms]) for frame in data.frames]
+    np.testing.assert_allclose(state, expected, rtol=0, atol=1e-8)
+
+
+def test_arms_that_were_renamed_and_swapped_are_recognized_by_their_values(tmp_path):
+    path = two_arms(tmp_path / "set")
+    for number, names in enumerate([("LEFT", "RIGHT"), ("PSM2", "PSM1")]):
+        options = ImportOptions(arms=dict(zip(names, ("PSM1", "PSM2"), strict=True)))
+        assert_state(imported(path, tmp_path / f"sequence{number}", options), tmp_path / f"out{number}", [*names])
+
+
+def test_columns_that_were_chosen_are_recognized_by_their_values(tmp_path):
+    names = [f"m{letter}" for letter in "abcdefg"]
+    path = with_states(dataset(tmp_path / "set"), names, [row[:7] for row in states(JOINTS, 0, LENGTHS[0])])
+    options = ImportOptions(columns=dict(zip([*JOINT_NAMES, "jaw"], names, strict=True)))
+    assert_state(imported(path, tmp_path / "sequence", options), tmp_path / "out", ["PSM1"])
 
 
 def test_the_command_finds_the_recording_and_refuses_another_one(tmp_path):

@@ -12,6 +12,7 @@ from recordings import digests, jaw_at, joints_at, pose_of, write_images
 
 from carts_core.errors import CartsError
 from carts_core.export import Dataset, ExportProgress, export
+from carts_core.export.source_tables import POSE
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import import_recording
@@ -87,20 +88,59 @@ def test_a_row_per_image_with_a_time_offset_gets_the_values_of_its_frame(tmp_pat
     assert [row["PSM1.corrected"] for row in rows] == ["1", "0", "1", "1", "1", "0"]
 
 
-def test_blank_separated_tables_keep_their_columns_without_a_verdict(tmp_path):
-    path = tmp_path / "set"
+def with_two_arms(path: Path) -> Path:
+    """A table separated by blanks."""
     write_images(path / "left", FRAMES)
     names = [f"{arm}_{name}" for arm in ("psm1", "psm2") for name in NAMES]
     rows = [values_at(number / RATE) + values_at(1 + number / RATE) for number in range(FRAMES)]
     np.savetxt(path / "joints.txt", rows, header=" ".join(names))
-    data = imported(path, tmp_path / "sequence")
+    return path
+
+
+@pytest.mark.parametrize("names", [("PSM1", "PSM2"), ("LEFT", "RIGHT")])
+def test_two_arms_are_recognized_by_their_values_and_blanks_separate_all_columns(tmp_path, names):
+    options = ImportOptions(arms=dict(zip(names, ("PSM1", "PSM2"), strict=True)))
+    data = imported(with_two_arms(tmp_path / "set"), tmp_path / "sequence", options)
     header, *lines = (export(data, "recorded-csv", tmp_path / "out") / "joints.txt").read_text().splitlines()
     columns = header.removeprefix("# ").split()
     for frame, line in zip(data.frames, lines, strict=True):
         row = dict(zip(columns, line.split(), strict=True))
-        assert row["PSM1.verdict"] == row["PSM2.verdict"] == (frame.verdict or "-")
-        found = [float(row[f"psm2_{name}.corrected"]) for name in NAMES]
-        np.testing.assert_allclose(found, frame.joint_positions["PSM2"], rtol=0, atol=1e-9)
+        for recorded, name in zip(("psm1", "psm2"), names, strict=True):
+            assert row[f"{name}.verdict"] == (frame.verdict or "-")
+            found = [float(row[f"{recorded}_{joint}.corrected"]) for joint in NAMES]
+            np.testing.assert_allclose(found, frame.joint_positions[name], rtol=0, atol=1e-9)
+
+
+def test_columns_that_were_chosen_are_recognized_by_their_values(tmp_path):
+    path = tmp_path / "set"
+    write_images(path / "left", FRAMES)
+    names = [f"m{letter}" for letter in "abcdefg"]
+    lines = [",".join(["note", *names])]
+    lines += [",".join(["x", *map(str, values_at(number / RATE))]) for number in range(FRAMES)]
+    (path / "motors.csv").write_text("\n".join(lines) + "\n")
+    options = ImportOptions(columns=dict(zip(NAMES, names, strict=True)))
+    data = imported(path, tmp_path / "sequence", options)
+    for frame, row in zip(
+        data.frames, rows_of(export(data, "recorded-csv", tmp_path / "out") / "motors.csv"), strict=True
+    ):
+        found = [float(row[f"{name}.corrected"]) for name in names]
+        np.testing.assert_allclose(found, frame.joint_positions["PSM1"], rtol=0, atol=1e-9)
+
+
+def test_an_empty_cell_of_a_pose_beside_joints_leaves_out_no_row(tmp_path):
+    path = tmp_path / "set"
+    write_images(path / "left", FRAMES)
+    lines = [",".join(["frame", *NAMES, *POSE])]
+    for number in range(FRAMES):
+        pose = map(repr, map(float, pose_of(forward(joints_at(number / RATE)))))
+        cells = ["" if (number, part) == (2, "y") else cell for part, cell in zip(POSE, pose, strict=True)]
+        lines.append(",".join([str(number), *map(str, values_at(number / RATE)), *cells]))
+    (path / "psm1.csv").write_text("\n".join(lines) + "\n")
+    data = imported(path, tmp_path / "sequence")
+    row = rows_of(export(data, "recorded-csv", tmp_path / "out") / "psm1.csv")[2]
+    found = [float(row[f"{name}.corrected"]) for name in ("yaw", "y")]
+    joints = data.frames[2].joint_positions["PSM1"]
+    np.testing.assert_allclose(found, [joints[0], forward(joints[:6])[1, 3]], rtol=0, atol=1e-9)
 
 
 def with_a_log(path: Path) -> Path:

@@ -18,10 +18,11 @@ from carts_core.model.camera import T_DVRK_OPENCV
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
+from carts_core.settings.interchange import ImportOptions
 
 
-def imported(path: Path, folder: Path) -> Dataset:
-    sequence = Sequence.open(import_recording(path, folder)[0])
+def imported(path: Path, folder: Path, options: ImportOptions | None = None) -> Dataset:
+    sequence = Sequence.open(import_recording(path, folder, options)[0])
     return Dataset(sequence, tuple(corrected(sequence)), sequence.scene.with_cameras(["left"]), "regular")
 
 
@@ -92,6 +93,17 @@ def test_masks_match_the_recorded_images(tmp_path, make):
         near = cv2.dilate(rendered.astype(np.uint8), np.ones((3, 3))) > 0
         middle = slice(4, -4), slice(4, -4)  # Pixels at the border map beyond the rendered image.
         assert (again | ~inner)[middle].all() and (~again | near).all()
+
+
+@pytest.mark.parametrize("make", [episode, clip])
+def test_an_arm_that_was_renamed_is_recognized_by_its_values(tmp_path, make):
+    path = make(tmp_path / "source")
+    outs = [
+        export(imported(path, tmp_path / name, options), "surgsync", tmp_path / f"out_{name}")
+        for name, options in {"same": None, "other": ImportOptions(arms={"LEFT": "PSM1"})}.items()
+    ]
+    first, second = ({name: digest for name, digest in digests(out).items() if "PSM1" in name} for out in outs)
+    assert first == second and first != digests(path)
 
 
 @pytest.mark.parametrize("make", [episode, clip])

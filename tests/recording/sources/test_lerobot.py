@@ -8,13 +8,12 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from lerobot_sets import FRAMES, JOINTS, LENGTHS, POSES, dataset, write_parquet
+from lerobot_sets import FRAMES, JOINTS, LENGTHS, POSES, dataset, two_arms, write_parquet
 from recordings import assert_refused, copied, image, jaw_at, joints_at, remove, write
 from videos import write_video
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
-from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.settings.interchange import ImportOptions
@@ -53,17 +52,11 @@ def test_a_second_episode_in_a_shared_video_begins_where_it_begins(tmp_path):
 
 
 def test_joints_with_equal_names_under_the_keys_of_two_arms_become_two_arms(tmp_path):
-    path = dataset(tmp_path / "set")
-    joints = [*JOINT_NAMES, "jaw"]
-    info_changed(lambda c: c["features"]["observation.state"].update(names={"psm1": joints, "psm2": joints}))(path)
-    file = path / FIRST
-    rows = [[*joints_at(n / 30), 0.1, *joints_at(1 + n / 30), 0.2] for n in range(LENGTHS[0])]
-    table = pyarrow.parquet.read_table(file)
-    pyarrow.parquet.write_table(table.set_column(0, "observation.state", pyarrow.array(rows)), file)
-    sequence = Sequence.open(import_recording(path, tmp_path / "out")[0])
+    sequence = Sequence.open(import_recording(two_arms(tmp_path / "set"), tmp_path / "out")[0])
     assert list(sequence.measured) == ["PSM1", "PSM2"]
-    for number, values in enumerate(sequence.measured.values()):
-        np.testing.assert_allclose(values, np.array(rows)[:, 7 * number : 7 * number + 7], rtol=0, atol=1e-8)
+    for start, values in enumerate(sequence.measured.values()):
+        expected = [joints_at(start + number / 30) for number in range(LENGTHS[0])]
+        np.testing.assert_allclose(values[:, :6], expected, rtol=0, atol=1e-8)
 
 
 def info_changed(change: Callable[[dict], object]) -> Callable[[Path], object]:
