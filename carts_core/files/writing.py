@@ -24,6 +24,7 @@ from typing import BinaryIO
 import msgspec
 
 from ..errors import OutputError
+from ..wording import listed
 from .paths import OutputPath, as_output, explained, kind_of, open_below, opened_folder, status
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -437,6 +438,8 @@ def _read_mark(folder: int) -> _Mark | None:
 
 MARKER = "export.json"
 """Name of the file that marks a folder as an export; other folders are never replaced."""
+_PROJECTS = (".carts", "_exports")
+"""Endings of projects and of the folders with their exports, which are not deleted with a replaced folder."""
 _OLD = "carts-replaced"
 """Temporary name of the replaced output, between two renames."""
 
@@ -450,7 +453,7 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
 
     Args:
         target: file or folder to create, which must not be a link. An empty folder counts as absent.
-        overwrite: replace an existing file, or a folder written by an export.
+        overwrite: replace an existing file, or a folder written by an export without a project in it.
         key: fingerprint of the inputs. If given, partial output is kept if the block fails, and a later call with the
             same key continues with the partial output.
 
@@ -510,7 +513,7 @@ def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
     if found is None:
         return
     if stat.S_ISDIR(found.st_mode):
-        if not _entries(folder, output.name):
+        if not (entries := _entries(folder, output.name)):
             return
         with _below(folder, output.name) as inside:
             marker = status(inside, MARKER)
@@ -518,6 +521,11 @@ def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
             raise OutputError(
                 f"{output} is a folder without {MARKER}; only folders written by an export are replaced. Choose a new "
                 "folder."
+            )
+        if overwrite and (kept := sorted(name for name in entries if name.endswith(_PROJECTS))):
+            raise OutputError(
+                f"{output} contains {listed(kept)}, which --overwrite would delete: projects (.carts) hold your edits. "
+                "Move them out of this folder, or choose another output."
             )
     elif not stat.S_ISREG(found.st_mode):
         raise OutputError(f"{output} is {kind_of(found)}, which is never replaced. Choose another output.")

@@ -15,8 +15,9 @@ from scipy.io import savemat
 from videos import write_video
 
 from carts_core.cli import main
-from carts_core.errors import CartsError
+from carts_core.errors import CartsError, OutputError
 from carts_core.model.psm_kinematics import JOINT_NAMES, forward
+from carts_core.project import Project
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.recording.importing.writing import write_sequence
@@ -101,6 +102,19 @@ def test_a_log_with_times_is_matched_with_a_table_of_image_times(tmp_path):
     assert any("are in ns (change: --clock)" in str(note) for note in found.notes)
     sequence = Sequence.open(file)
     assert np.abs(sequence.frame(3).measured["PSM2"][:6] - joints_at(0.3)).max() < 1e-5
+
+
+def test_a_project_in_the_folder_is_not_deleted_by_overwrite(folder: Path, tmp_path: Path) -> None:
+    file, _ = import_recording(folder, tmp_path / "out")
+    Project.open(Sequence.open(file)).close()
+    (tmp_path / "out/sequence_exports").mkdir()
+    project = (tmp_path / "out/sequence.carts").read_bytes()
+    with pytest.raises(OutputError, match=r"contains sequence\.carts, sequence_exports.* Move them out of this folder"):
+        import_recording(folder, tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out/sequence.carts").read_bytes() == project
+    (tmp_path / "out/sequence.carts").rename(tmp_path / "kept.carts")
+    (tmp_path / "out/sequence_exports").rmdir()
+    import_recording(folder, tmp_path / "out", overwrite=True)
 
 
 def test_a_video_with_another_clock_gets_a_guessed_offset_that_is_said(tmp_path):
