@@ -75,9 +75,12 @@ class Samples:
     """Time of each row in the table's clock, increasing [s]; None if row n belongs to frame n."""
     time_offset: float = 0.0
     """Time in the table's clock minus time in the clock of `[kinematics]` [s]."""
+    unlimited: Bool[np.ndarray, " dofs"] | bool = False
+    """Whether a joint is revolute without limits, so that its positions are equivalent modulo 2 pi."""
 
     def at_frames(self, frames: FrameList, matching: TimeMatching | None) -> Float[np.ndarray, "frames ..."]:
-        """Values of the frames; joints and positions are interpolated linearly, rotations spherically."""
+        """Values of the frames; joints and positions are interpolated linearly, rotations spherically, and joints
+        without limits through at most half a turn."""
         if matching is None:
             return self.values
         before, after, share, far = self._rows_at(frames, matching)
@@ -85,7 +88,9 @@ class Samples:
             raise self._too_far(frames, matching, np.flatnonzero(far))
         if self.values.ndim == 3:
             return self._poses_at(before + share * (after - before))
-        return (1.0 - share[:, None]) * self.values[before] + share[:, None] * self.values[after]
+        first, last = self.values[before], self.values[after]
+        last = last - np.where(self.unlimited, 2.0 * np.pi * np.round((last - first) / (2.0 * np.pi)), 0.0)
+        return (1.0 - share[:, None]) * first + share[:, None] * last
 
     def is_missing(self, frames: FrameList, matching: TimeMatching) -> Bool[np.ndarray, " frames"]:
         """Whether a frame has no rows within `max_gap`."""
@@ -111,7 +116,8 @@ class Samples:
         assert self.times is not None
         times = times + self.time_offset
         if self.values.ndim == 2:
-            return at_times(times, self.times, self.values)
+            values = np.where(self.unlimited, np.unwrap(self.values, axis=0), self.values)
+            return at_times(times, self.times, values)
         places = np.interp(times, self.times, np.arange(len(self.times), dtype=float), left=np.nan, right=np.nan)
         Ts = self._poses_at(np.nan_to_num(places))
         Ts[np.isnan(places)] = np.nan
@@ -171,7 +177,7 @@ class Rows:
         """Measured joint positions of an arm, from its `table` or the table of the sequence; errors as in `read`."""
         own = arm.take("table", str, "")
         table = self.read(arm.path(own)) if own else self.table
-        return replace(self.samples(table, columns.read(table)), time_offset=self.offset_of(arm))
+        return self._joints(arm, table, columns)
 
     def offset_of(self, arm: TomlTable) -> float:
         """Key `time_offset` of an arm [s]; `SequenceError` if rows are not matched by time."""
@@ -187,8 +193,11 @@ class Rows:
         own = arm.take("truth", str, "")
         if (path := arm.path(own) if own else self.truth) is None:
             return None
-        table = self.read(path)
-        return replace(self.samples(table, columns.read(table)), time_offset=self.offset_of(arm))
+        return self._joints(arm, self.read(path), columns)
+
+    def _joints(self, arm: TomlTable, table: Table, columns: JointColumns) -> Samples:
+        samples = self.samples(table, columns.read(table))
+        return replace(samples, time_offset=self.offset_of(arm), unlimited=columns.unlimited)
 
     def read(self, path: Path) -> Table:
         """Read another table, which must have the same frames or the same clock."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lab_robots import write_urdf
 from videos import write_video
 
 from carts_core.errors import SequenceError
@@ -62,6 +63,20 @@ def test_linear_interpolation_gives_the_joint_positions_at_the_time_of_the_image
 def test_the_nearest_row_is_taken_as_it_is(timed):
     sequence = Sequence.open(timed('table = "frames.csv"\ninterpolation = "nearest"'))
     assert yaw(sequence) == pytest.approx(SPEED * np.array([0.40, 0.50, 1.11]), abs=1e-12)
+
+
+def test_a_joint_without_limits_is_interpolated_through_half_a_turn(timed, tmp_path, shipped_psm):
+    urdf = write_urdf(tmp_path / "turning.urdf", dict.fromkeys(shipped_psm.joint_names, (-9.0, 9.0)))
+    urdf.write_text(urdf.read_text().replace("revolute", "continuous"))
+    shown = np.array([0.4, 0.404, 0.408])
+    path = timed(rows=shown[[0, 2]], shown=shown, edit=lambda text: text.replace("builtin:psm_lnd", str(urdf)))
+    table = path.parent / "kinematics.csv"
+    before, after = (repr(float(SPEED * now)) for now in shown[[0, 2]])
+    table.write_text(table.read_text().replace(before, "3.13").replace(after, "-3.13"))
+    sequence = Sequence.open(path)
+    assert np.abs(yaw(sequence)) == pytest.approx([3.13, np.pi, 3.13], abs=1e-9)
+    logged = sequence.logged_at(shown).joints["PSM1"][:, sequence.scene.arms[0].robot.joint_names.index("yaw")]
+    assert np.abs(logged)[1] == pytest.approx(np.pi, abs=1e-9)
 
 
 def test_another_offset_can_be_tried_without_touching_the_file(timed):
