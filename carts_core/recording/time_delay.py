@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from .matching import at_times, neighbours
 from .sequence import Sequence
@@ -149,10 +149,11 @@ def estimate_time_offsets(
     """
     present = sequence.checked_matching().time_offset
     assert sequence.timestamps is not None
-    frames, steps = _chosen(sequence.timestamps)
+    camera = camera or sequence.scene.cameras[0].name
+    frames, steps = _chosen(sequence.timestamps, sequence.frames_of(camera))
     if len(steps) < _MIN_STEPS:
         return _unknown(present, f"there are {len(steps)} steps between frames; at least {_MIN_STEPS} are needed.")
-    flows = _flows(sequence, camera or sequence.scene.cameras[0].name, domain, frames, steps, progress)
+    flows = _flows(sequence, camera, domain, frames, steps, progress)
     if np.sqrt((flows**2).mean()) < _STILL:
         return _unknown(present, "nothing moves in the images.")
     return _Delays(sequence, steps, flows, largest).estimate()
@@ -171,15 +172,20 @@ def _unknown(present: float, problem: str) -> tuple[TimeOffsetEstimate, ...]:
     return (TimeOffsetEstimate(present, present, float("inf"), 0.0, 0.0, problem),)
 
 
-def _chosen(times: Float[np.ndarray, " frames"]) -> tuple[list[int], Float[np.ndarray, "steps 2"]]:
-    """Frames to read, and pairs of neighbouring frames that are close enough in time."""
-    count, long = len(times), len(times) > _MAX_FRAMES
+def _chosen(times: Float[np.ndarray, " frames"], recorded: list[int]) -> tuple[list[int], Int[np.ndarray, "steps 2"]]:
+    """Frames to read, and pairs of neighbouring frames that are close enough in time.
+
+    Args:
+        times: time of each frame [s].
+        recorded: frames with an image.
+    """
+    count, long = len(recorded), len(recorded) > _MAX_FRAMES
     length = _MAX_FRAMES // _STRETCHES if long else count
     starts = np.linspace(0, count - length, _STRETCHES if long else 1).astype(int)
-    frames = sorted({int(start) + index for start in starts for index in range(length)})
-    pairs = [(a, b) for a, b in pairwise(frames) if b == a + 1]
+    places = sorted({int(start) + index for start in starts for index in range(length)})
+    pairs = [(recorded[a], recorded[b]) for a, b in pairwise(places) if b == a + 1]
     near = [(a, b) for a, b in pairs if 0.0 < times[b] - times[a] <= _MAX_STEP]
-    return frames, np.array(near, int).reshape(-1, 2)
+    return [recorded[place] for place in places], np.array(near, int).reshape(-1, 2)
 
 
 def _flows(

@@ -93,6 +93,20 @@ def test_few_frames_give_no_delay(recording: Path) -> None:
     assert found.problem == "there are 19 steps between frames; at least 60 are needed."
 
 
+def test_missing_images_give_no_flow(late: Path) -> None:
+    video = Sequence.open(late)
+    times = late.with_name("times.csv")
+    assert video.timestamps is not None
+    times.write_text("frame,timestamp\n" + "".join(f"{n},{time:.5f}\n" for n, time in enumerate(video.timestamps)))
+    late.with_name("left").mkdir()
+    for index in set(range(len(video))) - set(range(5, len(video), 6)):
+        cv2.imwrite(str(late.parent / f"left/{index}.png"), video.frame(index).images["left"][..., ::-1])
+    text = late.read_text().replace('[frames]\nvideo = "left.mp4"', '[frames]\ntable = "times.csv"')
+    late.write_text(text.replace('images = "left.mp4"', 'images = "left/{frame}.png"\nsparse_images = true'))
+    (found,) = estimate_time_offsets(Sequence.open(late))
+    assert abs(found.seconds - DELAY) < 0.010 and found.explained > 0.8
+
+
 def test_a_small_difference_is_not_worth_a_change() -> None:
     near = TimeOffsetEstimate(0.0, 0.007, 0.001, 0.9, 0.9, None)
     uncertain = TimeOffsetEstimate(0.0, 0.02, 0.01, 0.9, 0.9, None)
