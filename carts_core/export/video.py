@@ -2,15 +2,20 @@
 
 from contextlib import ExitStack
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from ..files import OutputPath, output_stream, unique_file_names
+from ..model.camera import Camera
 from ..model.scene import SceneState
 from ..rendering import ImageRenderer
 from .dataset import Dataset, ExportProgress, View
+
+if TYPE_CHECKING:
+    from av.container import OutputContainer
 
 _CONTOUR = (80, 255, 120)
 
@@ -46,29 +51,57 @@ _OPACITY = 0.5
 _QUALITY = {"crf": "18", "preset": "medium"}
 
 
+class _Video:
+    """Video of a camera, black in frames without an image."""
+
+    def __init__(self, container: "OutputContainer", camera: Camera, rate: Fraction) -> None:
+        self._container, self._stream = container, container.add_stream("libx264", rate=rate, options=_QUALITY)
+        # H.264 requires even widths and heights.
+        self._stream.width, self._stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
+        self._stream.pix_fmt = "yuv420p"
+        self._black = np.zeros((camera.height, camera.width, 3), np.uint8)
+        self._length = 0
+
+    def show(self, number: int, picture: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Append a picture as frame `number`, from 0."""
+        self._fill(number)
+        self._append(picture)
+
+    def finish(self, length: int) -> None:
+        """Write the remaining data of a video of `length` frames."""
+        self._fill(length)
+        self._container.mux(self._stream.encode(None))
+
+    def _fill(self, length: int) -> None:
+        while self._length < length:
+            self._append(self._black)
+
+    def _append(self, picture: UInt8[np.ndarray, "height width 3"]) -> None:
+        import av  # noqa: PLC0415  Not needed by other exports.
+
+        frame = av.VideoFrame.from_ndarray(_padded(picture), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+        self._length += 1
+
+
 def write_video(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
-    """Write `CAMERA.mp4` for every camera."""
+    """Write `CAMERA.mp4` for every camera, with a picture for each exported frame."""
     import av  # noqa: PLC0415  Not needed by other exports.
 
     rate = Fraction(frame_rate(dataset)).limit_denominator(1001)
     cameras = dataset.scene.cameras
     names = unique_file_names([camera.name for camera in cameras])
+    numbers = {frame.index: number for number, frame in enumerate(dataset.frames)}
     with ExitStack() as stack:
-        streams = {}
+        videos = {}
         for name, camera in zip(names, cameras, strict=True):
             file = stack.enter_context(output_stream(folder / f"{name}.mp4"))
             container = stack.enter_context(av.open(file, "w", format="mp4"))
-            stream = container.add_stream("libx264", rate=rate, options=_QUALITY)
-            # H.264 requires even widths and heights.
-            stream.width, stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
-            stream.pix_fmt = "yuv420p"
-            streams[camera.name] = container, stream
+            videos[camera.name] = _Video(container, camera, rate)
         for view in dataset.views(progress):
-            container, stream = streams[view.camera.name]
-            picture = av.VideoFrame.from_ndarray(_padded(_picture(dataset, view)), format="rgb24")
-            container.mux(stream.encode(picture))
-        for container, stream in streams.values():
-            container.mux(stream.encode(None))
+            videos[view.camera.name].show(numbers[view.frame.index], _picture(dataset, view))
+        for video in videos.values():
+            video.finish(len(dataset.frames))
 
 
 def frame_rate(dataset: Dataset) -> float:

@@ -4,11 +4,13 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
 from carts_core.cli import main
 from carts_core.errors import SequenceError, SettingsError
+from carts_core.export import Dataset, export, measured_frames
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, SurfaceSolver
 from carts_core.recording import Sequence
@@ -101,6 +103,20 @@ def test_commands_leave_out_frames_without_an_image_or_predict_them(
     with pytest.raises(SystemExit):
         said("calibrate", "--output", str(tmp_path / "none"), "--frames", "002")
     assert "no chosen frame has an image of right" in " ".join(capsys.readouterr().err.split())
+
+
+def test_videos_of_all_cameras_have_a_picture_of_every_frame(sparse: Path, tmp_path: Path) -> None:
+    sequence = marked(sparse)
+    folder = export(
+        Dataset(sequence, tuple(measured_frames(sequence, range(3))), sequence.scene, "regular"),
+        "video",
+        tmp_path / "out",
+    )
+    dark = {}
+    for name in ("left", "right"):
+        with av.open(str(folder / f"{name}.mp4")) as video:
+            dark[name] = [bool(picture.to_ndarray(format="gray").mean() < 20) for picture in video.decode(video=0)]
+    assert dark == {"left": [False, False, False], "right": [False, True, False]}
 
 
 def test_frames_with_one_camera_are_imported(sparse: Path, tmp_path: Path) -> None:
