@@ -49,6 +49,11 @@ def expand(pattern: str, key: str, **values: object) -> str:
     return filled
 
 
+def escaped(path: Path | str) -> str:
+    """Path as part of a pattern, with its braces doubled."""
+    return str(path).replace("{", "{{").replace("}", "}}")
+
+
 @lru_cache(maxsize=64)
 def _check_format(pattern: str) -> None:
     """Check a pattern; `KeyError` for unknown placeholders, `ValueError` for malformed or too wide placeholders."""

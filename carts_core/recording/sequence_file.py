@@ -25,7 +25,7 @@ from ..model.instruments import SCHEME, robot_file
 from ..model.robot import Robot
 from ..model.scene import Arm, Light, Scene
 from ..wording import closest, counted, listed, shown
-from .frame_list import FrameList, check_present, expand, frame_files, is_glob, is_per_frame, numbers_of_frames
+from .frame_list import FrameList, check_present, escaped, expand, frame_files, is_glob, is_per_frame, numbers_of_frames
 from .image_sources import VIDEO_SUFFIXES, BagImages, Cropped
 from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
 from .kinematics_table import take_joints
@@ -38,7 +38,7 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
     value = table.take(key, object, default)
     if not isinstance(value, str):
         return value
-    file_name, mark, pointer = value.partition("#")
+    file_name, mark, pointer = value.rpartition("#")
     if not mark or not pointer:
         raise table.error(
             key, f'is {shown(value)}. Write the numbers here, or "file.json#name" to read them from a file.'
@@ -464,18 +464,21 @@ def calibrated_sequence_file(
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
 
-    def relocate(value: str) -> str:
-        return value if os.path.isabs(value) else Path(os.path.relpath(source / value, target)).as_posix()
+    def relocate(value: str, pattern: bool) -> str:
+        if os.path.isabs(value):
+            return value
+        text = escaped if pattern else str
+        return Path(os.path.relpath(os.path.join(text(source), value), text(target))).as_posix()
 
-    def move(table: dict[str, Any], *keys: str) -> None:
+    def move(table: dict[str, Any], *keys: str, patterns: bool = False) -> None:
         for key in keys:
             value = table.get(key)
             if isinstance(value, str):
-                table[key] = relocate(value)
+                table[key] = relocate(value, patterns)
             elif isinstance(value, dict):
                 # The value is a table of patterns by domain, or K as a table of numbers.
                 for name, entry in value.items():
-                    value[name] = relocate(entry) if isinstance(entry, str) else entry
+                    value[name] = relocate(entry, patterns) if isinstance(entry, str) else entry
 
     move(document, "recording")
     move(document["kinematics"], "table", "truth")
@@ -494,7 +497,8 @@ def calibrated_sequence_file(
         if not np.array_equal(old.T_world_base, new.T_world_base):
             table["T_world_base"] = _matrix(new.T_world_base)
     for table, old, new in zip(document["cameras"], before.cameras, after.cameras, strict=True):
-        move(table, "images", "masks", "background", "size", "K", "distortion", "T_camera_world")
+        move(table, "images", "masks", "background", patterns=True)
+        move(table, "size", "K", "distortion", "T_camera_world")
         if isinstance(table.get("motion"), dict):
             move(table["motion"], "table")
         else:

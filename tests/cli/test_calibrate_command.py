@@ -1,6 +1,7 @@
 """`carts calibrate`, as a user types it, and the sequence file that it writes."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -111,3 +112,25 @@ def test_a_moved_sequence_file_keeps_references_comments_and_absolute_paths(sequ
     assert opened.scene.cameras[0].intrinsics == left.intrinsics
     assert opened.scene.cameras[1].intrinsics == before.scene.cameras[1].intrinsics
     assert np.array_equal(opened.frame(1).images["right"], before.frame(1).images["right"])
+
+
+@pytest.mark.parametrize("name", ["trial #3", "run{1} {{frame}}"])
+def test_a_moved_sequence_file_finds_folders_of_awkward_names(sequence: Path, tmp_path: Path, name: str) -> None:
+    cameras = Sequence.open(sequence).scene.cameras
+    parent = shutil.copytree(sequence.parent, tmp_path.parent / f"{tmp_path.name} copy" / name)
+    (parent / "calibration.json").write_text(json.dumps({camera.name: camera.K.tolist() for camera in cameras}))
+    shutil.copy(next((parent / "regular/left").iterdir()), parent / "empty_regular.png")
+    text = re.sub(
+        r"^K = .*", 'K = "calibration.json#LEFT"\nbackground = "empty_{domain}.png"', sequence.read_text(), flags=re.M
+    )
+    (parent / "sequence.toml").write_text(text.replace("LEFT", "left", 1).replace("LEFT", "right", 1))
+    before = Sequence.open(parent / "sequence.toml")
+    (tmp_path / "out").mkdir()
+    copy = tmp_path / "out" / "sequence.toml"
+    copy.write_text(calibrated_sequence_file(before.path, copy.parent, before.scene, before.scene))
+    opened, wanted = Sequence.open(copy).frame(1), before.frame(1)
+    assert opened.masks is not None and wanted.masks is not None
+    for camera in ("left", "right"):
+        assert np.array_equal(opened.images[camera], wanted.images[camera])
+        assert np.array_equal(opened.masks[camera], wanted.masks[camera])
+        assert np.array_equal(Sequence.open(copy).background(camera), before.background(camera))

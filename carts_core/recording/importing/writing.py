@@ -21,6 +21,7 @@ from ...model.robot import Robot
 from ...settings.interchange import ImportOptions
 from ...wording import counted
 from .. import Sequence
+from ..frame_list import escaped
 from ..kinematics_table import TableError, joints_of
 from ..matching import ORIENTATION, POSITION, neighbours
 from .cameras import check_intrinsics, placed_cameras
@@ -337,12 +338,12 @@ def _toml(recording: FoundRecording, place: Path) -> str:
         robot = arm.robot if arm.robot.startswith(SCHEME) else _relative(urdf, place)
         arms.append((arm, robot, columns, [name for name in names if name not in known]))
     for camera in recording.cameras:
-        images, masks = _relative(camera.images, place), ""
+        images, masks = escaped(_relative(camera.images, place)), ""
         if camera.pattern:
-            images = f"{images.replace('{', '{{').replace('}', '}}')}/{camera.pattern}"
+            images = f"{images}/{camera.pattern}"
         if camera.masks:
-            parent = _relative(Path(camera.masks).parent, place).replace("{{", "{").replace("}}", "}")
-            masks = f"{parent}/{Path(camera.masks).name}"
+            parent, pattern = os.path.split(camera.masks)
+            masks = f"{escaped(_relative(Path(parent), place))}/{pattern}"
         pose = np.eye(4) if camera.T_camera_world is None else camera.T_camera_world
         cameras.append((camera, images, masks, pose))
     return render_page(

@@ -62,7 +62,7 @@ def test_a_set_of_cts_has_its_domains_masks_and_both_arms(tmp_path):
 
 
 def test_a_simulated_video_has_its_camera_and_insertion_in_metres(tmp_path):
-    file, found = import_recording(ambf(tmp_path / "Video_01"), tmp_path / "out")
+    file, found = import_recording(ambf(tmp_path / "run{1}/Video_01"), tmp_path / "out")
     sequence = Sequence.open(file)
     frame = sequence.frame(3)
     assert np.abs(frame.measured["PSM2"][:6] - joints_at(0.3)).max() < 1e-8

@@ -176,6 +176,13 @@ def test_a_calibration_beside_a_video_is_no_sidecar_of_a_dvrk_session(tmp_path):
     assert found.arms and found.cameras[0].intrinsics == (110, 110, 47.5, 35.5)
 
 
+def test_a_video_in_a_folder_with_braces_is_found(tmp_path):
+    (tmp_path / "run{1}").mkdir()
+    write_video(tmp_path / "run{1}/left.mp4", [image(number) for number in range(FRAMES)])
+    write_csv(tmp_path / "run{1}/log.csv", [f"q{n}" for n in range(6)], joints_at(np.arange(FRAMES) / 25))
+    assert len(Sequence.open(import_recording(tmp_path / "run{1}", tmp_path / "out")[0])) == FRAMES
+
+
 def test_arrays_of_different_lengths_are_named(tmp_path):
     write_images(tmp_path / "rec/left", FRAMES)
     np.savez(tmp_path / "rec/log.npz", time=np.arange(3), joints=joints_at(np.arange(FRAMES) / 10))
