@@ -265,9 +265,12 @@ def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
             "not allowed. Name the folder."
         )
 
-    def natural(path: Path) -> list[tuple[int, str]]:
-        # `frame9` comes before `frame10`.
-        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+    def natural(path: Path) -> list[list[tuple[int, str]]]:
+        # `part2/frame9` comes before `part2/frame10`, and this before `part10/frame1`.
+        return [
+            [(int(text), "") if text.isdecimal() else (-1, text) for text in re.split(r"(\d+)", part)]
+            for part in path.relative_to(fixed).parts
+        ]
 
     try:
         return fixed, sorted(filter(is_regular, fixed.glob(str(wild))), key=natural)

@@ -202,6 +202,19 @@ def test_files_may_be_named_by_a_glob_in_natural_order(tiny_sequence):
     assert not np.array_equal(sequence.frame(1).images["left"], last)
 
 
+def test_a_glob_with_several_folders_has_the_files_of_one_folder_after_those_of_another(tiny_sequence):
+    path = tiny_sequence(frames=6, edit=replaced("{domain}/{camera}/{frame}.png", "part*/frame*.png"))
+    for row in range(6):
+        part = path.parent / ("part2" if row < 3 else "part10")
+        part.mkdir(exist_ok=True)
+        (path.parent / f"regular/left/{row + 1:03d}.png").rename(part / f"frame{row % 3}.png")
+    files = [Sequence.open(path).image_file(index, "left") for index in range(6)]
+    assert [file and str(file.relative_to(path.parent)) for file in files] == [
+        *(f"part2/frame{n}.png" for n in range(3)),
+        *(f"part10/frame{n}.png" for n in range(3)),
+    ]
+
+
 def test_the_frame_number_can_be_padded_in_the_pattern(tiny_sequence):
     path = tiny_sequence(
         masks=False, edit=lambda text: text.replace('frame_id = "{frame:03d}"\n', "").replace("{frame}", "{frame:03d}")
