@@ -106,13 +106,15 @@ def _named(items: tuple[Any, ...]) -> list[tuple[Any, str]]:
 
 
 def _stamp(dataset: Dataset, view: View) -> Stamp:
-    """Times of a view: those of the message with its image, else its timestamp, or its index at the frame rate."""
+    """Times of a view: those of the message with its image, else the time since the first image, by timestamps or by
+    index and frame rate."""
     sequence, index = dataset.sequence, view.frame.index
     source = sequence.image_source(view.camera.name, dataset.domain)
     source = source.source if isinstance(source, Cropped) else source
     if isinstance(source, BagImages):
         return Stamp(*source.times_of(index))
-    seconds = index / frame_rate(dataset) if sequence.timestamps is None else sequence.timestamps[index]
+    times = sequence.timestamps
+    seconds = index / frame_rate(dataset) if times is None else times[index] - times.min()
     time = round(float(seconds) * _NANOSECONDS)
     return Stamp(time, time)
 

@@ -86,3 +86,13 @@ def test_other_sequences_have_the_time_since_the_first_image(tmp_path, tiny_sequ
     own = found["/PSM1/corrected/measured_js"]
     assert [time for time, _ in own] == pytest.approx(np.asarray(sequence.timestamps) * ROS_TO_NS, abs=1)
     assert psm_geometry(shipped_psm) == CLASSIC
+
+
+def test_times_before_zero_count_from_the_first_image(tmp_path, tiny_sequence):
+    path = tiny_sequence(frames=3)
+    table = path.with_name("kinematics.csv")
+    table.write_text(table.read_text().replace(",0.000,", ",-12.5,").replace(",0.100,", ",-12.4,"))
+    sequence = Sequence.open(path)
+    data = Dataset(sequence, tuple(corrected(sequence)), sequence.scene, "regular")
+    own = messages(export(data, "rosbag2", tmp_path / "out"))["/PSM1/corrected/measured_js"]
+    assert [time for time, _ in own] == [stamp_of(message) for _, message in own] == [0, 100_000_000, 12_700_000_000]
