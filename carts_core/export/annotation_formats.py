@@ -108,7 +108,8 @@ def write_annotations(
         "annotations": annotations,
         "categories": categories,
     }
-    write_text(folder / "annotations" / f"{kind}_default.json", json.dumps(content, ensure_ascii=False))
+    # Non-ASCII characters are escaped, since paths need not be UTF-8.
+    write_text(folder / "annotations" / f"{kind}_default.json", json.dumps(content))
 
 
 _OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2

@@ -231,7 +231,7 @@ def export(
 
 
 def _summary(dataset: Dataset, name: FormatName) -> str:
-    """Description of an exported folder, as JSON."""
+    """Description of an exported folder, as JSON; non-ASCII characters are escaped, since paths need not be UTF-8."""
     views = [
         {
             "name": name,
@@ -249,4 +249,4 @@ def _summary(dataset: Dataset, name: FormatName) -> str:
         for (name, frame, camera), file in zip(dataset.steps, dataset.files, strict=True)
     ]
     content = {"format": name, "sequence": dataset.sequence.name, "domain": dataset.domain, "views": views}
-    return json.dumps(content, indent=1, ensure_ascii=False)
+    return json.dumps(content, indent=1)

@@ -1,6 +1,8 @@
 """Annotation formats and their encodings, read back by their own readers."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 import tracemalloc
@@ -19,7 +21,7 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from scipy.ndimage import gaussian_filter
 
-from carts_core.export import Dataset, FormatName, Images, export
+from carts_core.export import FORMATS, Dataset, FormatName, Images, export
 from carts_core.export.encodings import MIN_POINTS, bounding_box, polygons, row_runs
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
@@ -126,6 +128,19 @@ def test_images_elsewhere_are_named_relative_to_their_folder(own_dataset: Datase
     dataset = replace(own_dataset, sequence=Sequence.open(moved))
     assert dataset.image_folder == path.parent / "regular" / "left"
     assert [dataset.image_name(view) for view in all_views(dataset)] == ["001.png", "002.png", "003.png"]
+
+
+@pytest.mark.parametrize("name", [name for name, known in FORMATS.items() if not known.source])
+def test_folders_whose_name_is_not_utf_8_are_exported(own_dataset: Dataset, tmp_path: Path, name: FormatName) -> None:
+    folder = shutil.copytree(own_dataset.sequence.path.parent, tmp_path / os.fsdecode(b"caf\xe9"))
+    dataset = replace(own_dataset, sequence=Sequence.open(folder / own_dataset.sequence.path.name))
+    out = export(dataset, name, tmp_path / "out")
+    if out.is_dir():
+        views = json.loads((out / "export.json").read_text())["views"]
+        assert [view["image"] for view in views] == [str(folder / name) for name in NAMES]
+    if name == "coco":
+        info = json.loads((out / "annotations/instances_default.json").read_text())["info"]
+        assert info["image_folder"] == str(folder)
 
 
 def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
