@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import SequenceError
 from ..files.reading import CALIBRATION, TABLE, read_bytes
 
 MAX_CELLS, MAX_ROWS, MAX_COLUMNS = 10_000_000, 1_500_000, 10_000
 """Maximum number of values, rows and columns of a table."""
+_MAX_VALUES = 50_000_000
+"""Maximum number of values of a Parquet file; LeRobot v3.0 stores a million rows of 30 values in a file of 100 MB."""
 LIBRARIES = {
     "read_parquet": ("pyarrow.parquet",),
     "extended_parquet": ("pyarrow.parquet",),
@@ -26,7 +29,8 @@ def read_parquet(path: Path) -> dict[str, Any]:
     `struct.field`.
 
     Raises:
-        OSError, ValueError: the file cannot be read, or has too many values.
+        OSError, ValueError: the file cannot be read.
+        SequenceError: it has too many values, rows or columns.
     """
     import pyarrow  # noqa: PLC0415 - an extra
     import pyarrow.parquet  # noqa: PLC0415
@@ -36,19 +40,19 @@ def read_parquet(path: Path) -> dict[str, Any]:
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
         # Runs of equal values take few bytes, so the file size does not limit the number of values.
         cells = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
-        check_size(-(-cells // max(file.metadata.num_columns, 1)), file.metadata.num_columns)
+        check_size(path, file.metadata.num_rows, file.metadata.num_columns, cells, _MAX_VALUES)
         table = file.read()
         while any(pyarrow.types.is_struct(column.type) for column in table.itercolumns()):
             table = table.flatten()
     except pyarrow.ArrowException as error:
         raise ValueError(str(error)) from error
-    columns = {}
+    values = {}
     for name in table.column_names:
         column = table.column(name)
         kind = column.type
         nested = pyarrow.types.is_list(kind) or pyarrow.types.is_fixed_size_list(kind)
-        columns[name] = _matrix(column.to_pylist()) if nested else column.to_numpy()
-    return columns
+        values[name] = _matrix(column) if nested else column.to_numpy()
+    return values
 
 
 def extended_parquet(path: Path, columns: dict[str, list[Any]]) -> bytes:
@@ -62,6 +66,7 @@ def extended_parquet(path: Path, columns: dict[str, list[Any]]) -> bytes:
 
     Raises:
         OSError, ValueError: the file cannot be read, or has another number of rows.
+        SequenceError: it has too many rows.
     """
     import pyarrow  # noqa: PLC0415 - an extra
     import pyarrow.parquet  # noqa: PLC0415
@@ -69,7 +74,7 @@ def extended_parquet(path: Path, columns: dict[str, list[Any]]) -> bytes:
     try:
         file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
         lengths = [file.metadata.row_group(number).num_rows for number in range(file.metadata.num_row_groups)]
-        check_size(file.metadata.num_rows)
+        check_size(path, file.metadata.num_rows)
         table = file.read()
         described = json.loads((table.schema.metadata or {}).get(b"huggingface", b"{}"))
         features = described.get("info", {}).get("features", {})
@@ -114,17 +119,18 @@ def _feature(kind: str, values: Any, sequence: str) -> dict[str, Any]:
     return value if values.ndim == 1 else {"feature": value, "length": int(values.shape[1]), "_type": sequence}
 
 
-def _matrix(rows: list[list[Any] | None]) -> Any:
-    """Convert rows of numbers to an array, with NaN for missing rows; returns the list if rows are not numeric or
-    differ in length."""
-    lengths = {len(row) for row in rows if row is not None}
-    if len(lengths) != 1:
-        return rows
-    missing = [np.nan] * lengths.pop()
-    try:
-        return np.array([missing if row is None else row for row in rows], np.float64)
-    except (TypeError, ValueError):
-        return rows
+def _matrix(column: Any) -> Any:
+    """Convert an Arrow column of lists of numbers to an array, with NaN for missing rows; returns Python lists if rows
+    are not numeric or differ in length."""
+    from pyarrow import compute, types  # noqa: PLC0415 - an extra
+
+    lengths = compute.call_function("list_value_length", [column]).drop_null().unique().to_pylist()
+    kind = column.type.value_type
+    if len(lengths) != 1 or not (types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)):
+        return column.to_pylist()
+    found, there = np.full((len(column), lengths[0]), np.nan), column.is_valid().to_numpy()
+    found[there] = compute.call_function("list_flatten", [column]).to_numpy().reshape(there.sum(), lengths[0])
+    return found
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -175,13 +181,19 @@ def _name_of_object(name: str, value: Any) -> str:
     return "stereoParams" if name in ("None", "__function_workspace__") else ""
 
 
-def check_size(rows: int, columns: int = 1) -> None:
-    """Check the number of rows and columns of a table.
+def check_size(
+    path: Path, rows: int, columns: int = 1, values: int | None = None, most_values: int = MAX_CELLS
+) -> None:
+    """Check the number of rows, columns and values of a table; by default, each column has one value per row.
 
     Raises:
-        ValueError: there are too many rows, columns or values.
+        SequenceError: there are too many rows, columns or values.
     """
-    limits = (rows * columns, MAX_CELLS, "values"), (rows, MAX_ROWS, "rows"), (columns, MAX_COLUMNS, "columns")
+    values = rows * columns if values is None else values
+    limits = (values, most_values, "values"), (rows, MAX_ROWS, "rows"), (columns, MAX_COLUMNS, "columns")
     for count, most, what in limits:
         if count > most:
-            raise ValueError(f"it has {count:,} {what}; the limit is {most:,}")
+            raise SequenceError(
+                f"table {path} has {count:,} {what}; at most {most:,} are read. Split it into several files, or remove "
+                "rows or columns that are not needed."
+            )

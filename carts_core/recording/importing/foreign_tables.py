@@ -108,7 +108,7 @@ def _csv(path: Path) -> ForeignTable:
     if lines[0].startswith("#"):
         lines[0] = lines[0].lstrip("# ")
     delimiter = delimiter_of(lines[:50])
-    tables.check_size(len(lines), lines[0].count(delimiter or " ") + 1)
+    tables.check_size(path, len(lines), lines[0].count(delimiter or " ") + 1)
     cells = map(str.split, lines) if delimiter is None else csv.reader(lines, delimiter=delimiter)
     rows, remarks = _even([[cell.strip() for cell in row] for row in cells], numbers)
     first, width = rows[0], len(rows[0])

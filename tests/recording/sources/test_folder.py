@@ -19,6 +19,7 @@ from carts_core.errors import CartsError, OutputError
 from carts_core.model.psm_kinematics import JOINT_NAMES, forward
 from carts_core.project import Project
 from carts_core.recording import Sequence
+from carts_core.recording.importing.foreign_tables import read_foreign_table
 from carts_core.recording.importing.importer import find, import_recording
 from carts_core.recording.importing.writing import write_sequence
 from carts_core.settings.interchange import ImportOptions
@@ -174,6 +175,20 @@ def test_a_calibration_beside_a_video_is_no_sidecar_of_a_dvrk_session(tmp_path):
     write_csv(tmp_path / "rec/log.csv", [f"q{n}" for n in range(6)], joints_at(np.arange(FRAMES) / 25))
     found = find(tmp_path / "rec")
     assert found.arms and found.cameras[0].intrinsics == (110, 110, 47.5, 35.5)
+
+
+def test_a_table_of_a_thousand_episodes_is_read_and_a_larger_one_is_refused_with_the_limit(tmp_path):
+    values = np.random.default_rng(0).normal(size=(400_000, 14)).astype(np.float32)
+    listed = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.reshape(-1)), 14)
+    pyarrow.parquet.write_table(pyarrow.table({"state": listed, "action": listed}), tmp_path / "file.parquet")
+    columns = read_foreign_table(tmp_path / "file.parquet").columns
+    assert np.array_equal(columns["action.13"], values[:, 13]) and len(columns) == 28
+    pyarrow.parquet.write_table(pyarrow.table({"q": np.zeros(1_500_001, np.int8)}), tmp_path / "long.parquet")
+    with pytest.raises(
+        CartsError, match=r"long\.parquet has 1,500,001 rows; at most 1,500,000 are read\. Split it"
+    ) as refusal:
+        read_foreign_table(tmp_path / "long.parquet")
+    assert "again" not in str(refusal.value)
 
 
 def test_a_video_in_a_folder_with_braces_is_found(tmp_path):
