@@ -112,6 +112,9 @@ class _CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
     def __getitem__(self, camera: str) -> Bool[np.ndarray, "height width"]:
         return self._corrections[camera].applied_to(self._render(self._pose, camera))
 
+    def __contains__(self, camera: object) -> bool:
+        return camera in self._corrections
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._corrections)
 

@@ -23,11 +23,14 @@ from carts_core.export import (
     export,
     measured_frames,
     network_refiner,
+    project_frame,
 )
 from carts_core.export.dataset import labelled
 from carts_core.files import file_name, unique_file_names
 from carts_core.model.parts import part_classes
+from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
+from carts_core.project import Key, MaskCorrection, Project
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_mask
 from carts_core.rendering import Renderer
@@ -76,6 +79,20 @@ def test_pixels_that_nothing_rendered_explains_are_an_error() -> None:
 def test_a_mask_of_another_size_or_kind_is_an_error(mask: np.ndarray) -> None:
     with pytest.raises(CartsError, match=r"here: the mask is .*Give a Boolean mask"):
         labelled(mask, np.array([[-1, -1]]), "here")
+
+
+def test_a_painted_mask_is_rendered_once_for_each_view(sequence: Sequence, tmp_path: Path) -> None:
+    rendered, nothing = [], np.zeros((127, 161), bool)
+
+    def render(pose: SceneState, camera: str) -> np.ndarray:
+        rendered.append(camera)
+        return nothing
+
+    with Project.open(sequence, tmp_path / "painted.carts") as project:
+        project.apply("Paint", {Key.mask_correction(1, CAMERA): MaskCorrection.of(nothing, nothing)})
+        frame = project_frame(sequence, project.state, 1, [CAMERA], render)
+    painted = Dataset(sequence, (frame,), sequence.scene, "regular")
+    assert [view.mask for view in all_views(painted)] == ["painted"] and rendered == [CAMERA]
 
 
 def test_names_are_safe_and_unique(dataset: Dataset) -> None:
