@@ -383,7 +383,7 @@ class Sequence:
             self._check_size(mask, camera, f"mask {path}")
             return entry.camera.undistort(mask)
 
-        return self._cache.get(("mask", str(path)), decode).copy()
+        return self._cache.get(("mask", camera, str(path)), decode).copy()
 
     def _check_size(self, image: np.ndarray, camera: str, what: str) -> None:
         height, width = image.shape[:2]

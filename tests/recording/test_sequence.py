@@ -192,6 +192,18 @@ def test_images_and_masks_of_a_distorted_camera_arrive_undistorted(tiny_sequence
     assert not np.array_equal(frame.images["left"], plain.images["left"])
 
 
+def test_cameras_that_share_masks_each_undistort_them(tiny_sequence):
+    def edit(text: str) -> str:
+        left, right = text.replace("masks/{camera}/", "masks/left/").split('name = "right"')
+        return f'{left}name = "right"\ndistortion = [-0.4, 0.1, 0.0, 0.0]{right}'
+
+    sequence = Sequence.open(tiny_sequence(cameras=("left", "right"), edit=edit))
+    masks = sequence.frame(1).masks
+    assert masks is not None
+    assert np.array_equal(masks["right"], sequence.scene.cameras[1].undistort(masks["left"]))
+    assert not np.array_equal(masks["right"], masks["left"])
+
+
 def test_files_may_be_named_by_a_glob_in_natural_order(tiny_sequence):
     path = tiny_sequence(frames=11, edit=replaced("{domain}/{camera}/{frame}.png", "{domain}/{camera}/shot*.png"))
     for row in range(1, 12):
