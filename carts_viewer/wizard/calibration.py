@@ -15,7 +15,14 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.files import name_fault
 from carts_core.model.camera import rigid_transform
 from carts_core.model.scene import Scene
-from carts_core.optimization.hand_eye import ImagePoint, PointAgreement, PoseDeviation, agreement_with_points
+from carts_core.optimization.hand_eye import (
+    ImagePoint,
+    PointAgreement,
+    PoseDeviation,
+    agreement_with_points,
+    mounts_of_points,
+    moved_cameras,
+)
 from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.wording import counted
 from carts_viewer.jobs.solver import Calibrated, CalibrationStep, Started
@@ -161,8 +168,11 @@ def report_of(result: Calibrated, clicking: Clicking, points: Rows[ImagePoint]) 
     """Report of a calibration that started from the clicked points."""
     found = clicking.result
     assert found is not None
-    scene = result.calibration.applied_to(clicking.scene)
-    compared = agreement_with_points(scene, clicking.sequence.measured, points, found)
+    mounts = mounts_of_points(clicking.sequence, points)
+    old, new = (
+        moved_cameras(scene, mounts) for scene in (clicking.scene, result.calibration.applied_to(clicking.scene))
+    )
+    compared = agreement_with_points(new, clicking.sequence.measured, points, found)
     before, after = (
         tuple(float(each) if np.isfinite(each) else None for each in row) for row in (compared.before, compared.after)
     )
@@ -171,7 +181,7 @@ def report_of(result: Calibrated, clicking: Clicking, points: Rows[ImagePoint]) 
         loss_after=result.loss_after,
         verdict=result.verdict,
         reason=result.reason,
-        poses=_poses(result, scene, clicking, points),
+        poses=_poses(result, old, new, clicking, points),
         before=before,
         after=after,
         disagreeing=compared.disagreeing,
@@ -200,16 +210,16 @@ def _objection(result: Calibrated, compared: PointAgreement, clicking: Clicking,
     return result.beyond[:1].upper() + result.beyond[1:]
 
 
-def _poses(result: Calibrated, after: Scene, clicking: Clicking, points: Rows[ImagePoint]) -> tuple[PoseReport, ...]:
+def _poses(
+    result: Calibrated, before: Scene, after: Scene, clicking: Clicking, points: Rows[ImagePoint]
+) -> tuple[PoseReport, ...]:
     """Change of the pose of each arm in each camera."""
     frames = sorted({point.frame for point in points})
     poses = []
     for (name, camera), deviation in result.deviations.items():
-        arm = clicking.scene.arm(name)
-        middle = arm.robot.forward_kinematics(clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
-        old, new = (
-            scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base for scene in (clicking.scene, after)
-        )
+        robot = before.arm(name).robot
+        middle = robot.forward_kinematics(clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
+        old, new = (scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base for scene in (before, after))
         turn = Rotation.from_matrix(new[:3, :3] @ old[:3, :3].T).magnitude()
         shift = np.linalg.norm((new - old)[:3] @ middle)
         poses.append(PoseReport(name, camera, float(np.degrees(turn)), 1e3 * float(shift), deviation))

@@ -292,9 +292,16 @@ class HandEyeStep:
         """Move the prompts to the nearest unused frame."""
         used = {(entry.camera, entry.frame) for entry in self._clicking.plan}
         used |= {(point.camera, point.frame) for point in draft.points}
-        free = [frame for frame in self._sequence.frames_of(prompt.camera) if (prompt.camera, frame) not in used]
+        free = [
+            frame
+            for frame in self._sequence.frames_of(prompt.camera)
+            if frame in self._clicking.frames and (prompt.camera, frame) not in used
+        ]
         if not free:
-            raise SettingsError("all frames are in use. Use the list below, or skip landmarks that are not visible.")
+            raise SettingsError(
+                "all frames with this camera pose are in use. Choose a frame below the image, or skip landmarks that "
+                "are not visible."
+            )
         other = min(free, key=lambda frame: abs(frame - prompt.frame))
         self._clicking.move_frame(prompt.camera, prompt.frame, other)
         self._wanted = None

@@ -8,13 +8,23 @@ import numpy as np
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import SHAFT_EDGE, TIP, LandmarkKind, landmarks
 from carts_core.model.scene import Scene
-from carts_core.optimization.hand_eye import HandEyeResult, HandEyeSettings, ImagePoint, solve_hand_eye
-from carts_core.recording import Sequence
+from carts_core.optimization.hand_eye import (
+    HandEyeResult,
+    HandEyeSettings,
+    ImagePoint,
+    mounts_of_points,
+    moved_cameras,
+    solve_hand_eye,
+)
+from carts_core.optimization.hand_eye.files import STATIONARY_TOLERANCE
+from carts_core.recording import Sequence, evenly_spaced
 
 _FRAMES = 4
 """Number of frames to click in the first camera."""
 _FURTHER_FRAMES = 2
 """Number of frames to click in each other camera."""
+_COMPARED_FRAMES = 50
+"""Number of frames among which the most frequent camera pose is sought."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,7 @@ class Clicking:
 
     Attributes:
         sequence: the recording, with placeholder base frames.
+        frames: frames with the same camera poses, for prompts.
         plan: all prompts, in order.
         result: calibration from the points; None if there are too few points.
         problem: cause of a missing result.
@@ -39,7 +50,8 @@ class Clicking:
 
     def __init__(self, sequence: Sequence, *, focal_length: bool = False) -> None:
         self.sequence = sequence
-        self.plan = _plan(sequence)
+        self.frames = _stationary(sequence)
+        self.plan = _plan(sequence, self.frames)
         self.result: HandEyeResult | None = None
         self.problem = ""
         self._settings = HandEyeSettings(focal_length=focal_length, free_cameras=unknown_cameras(sequence.scene))
@@ -66,10 +78,13 @@ class Clicking:
         )
 
     def solve(self, points: Rows[ImagePoint]) -> None:
-        """Compute the calibration from the points."""
+        """Compute the calibration from the points, which must be in frames with the same camera poses."""
         self.result, self.problem = None, ""
         try:
-            self.result = solve_hand_eye(self.sequence.scene, self.sequence.measured, points, self._settings)
+            mounts = mounts_of_points(self.sequence, points)
+            scene = moved_cameras(self.sequence.scene, mounts)
+            result = solve_hand_eye(scene, self.sequence.measured, points, self._settings)
+            self.result = replace(result, scene=moved_cameras(result.scene, mounts, back=True))
         except CartsError as error:
             self.problem = str(error)
 
@@ -90,7 +105,19 @@ def unknown_cameras(scene: Scene) -> tuple[str, ...]:
     )
 
 
-def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
+def _stationary(sequence: Sequence) -> frozenset[int]:
+    """Frames of the first camera's images with the most frequent pose of the moving cameras."""
+    present = sequence.frames_of(sequence.scene.cameras[0].name)
+    mounts = np.array([[*sequence.mounts(frame).values()] for frame in present]).reshape(len(present), -1)
+    # With half the tolerance of each, two frames differ by at most the tolerance.
+    alike = [
+        np.abs(mounts - mounts[row]).max(axis=1, initial=0.0) <= STATIONARY_TOLERANCE / 2
+        for row in evenly_spaced(len(present), _COMPARED_FRAMES)
+    ]
+    return frozenset(present[row] for row in np.flatnonzero(max(alike, key=np.sum)))
+
+
+def _plan(sequence: Sequence, usable: frozenset[int]) -> tuple[ClickPrompt, ...]:
     """Prompts in frames with arm positions far from each other."""
     scene = sequence.scene
     arms = [arm for arm in scene.arms if len(sequence.measured[arm.name])]
@@ -103,7 +130,8 @@ def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
         if number and camera.name not in unknown:
             # The first camera suffices for a calibrated pair.
             continue
-        present = sequence.frames_of(camera.name)
+        if not (present := [frame for frame in sequence.frames_of(camera.name) if frame in usable]):
+            continue
         frames = [present[row] for row in spread_out(tips[present], _FRAMES)]
         chosen = frames if number == 0 else [frames[row] for row in (0, -1)][:_FURTHER_FRAMES]
         for frame in dict.fromkeys(chosen):

@@ -5,16 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moving import let_camera_move, swing
+from clicked_points import clicked
+from moving import Motion, let_camera_move, swing
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError
 from carts_core.evaluation.metrics import dice
+from carts_core.optimization import StopReason
+from carts_core.optimization.hand_eye import moved_cameras
 from carts_core.project import CorrectedTransform, Key, Project, Provenance, Source, TimeOffset
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
 from carts_viewer.jobs.optimizers import OptimizerFactory
-from carts_viewer.jobs.solver import scene_at
+from carts_viewer.jobs.solver import Calibrated, Calibration, scene_at
+from carts_viewer.wizard.calibration import report_of
+from carts_viewer.wizard.points import Clicking
 
 FRAMES = 4
 
@@ -144,3 +149,26 @@ def test_a_recording_without_times_has_no_offset(tiny_sequence: Callable[..., Pa
     assert desk.session.time_offset is None
     with pytest.raises(CartsError, match="a time offset does not apply"):
         desk.do(intents.SetTimeOffset(0.1))
+
+
+def test_points_of_a_moving_camera_are_planned_solved_and_reported_at_one_pose(
+    tiny_sequence: Callable[..., Path],
+) -> None:
+    motion = Motion(swing(FRAMES, 3.0, 0.002).Ts_world_mount[[0, 1, 1, 1]])
+    sequence = Sequence.open(let_camera_move(tiny_sequence(frames=FRAMES, width=160, height=120), motion))
+    clicking = Clicking(sequence)
+    assert {prompt.frame for prompt in clicking.plan} == {1, 2, 3}
+    there = moved_cameras(sequence.scene, sequence.mounts(1))
+    points = clicked(there, sequence.measured, (1, 2, 3), ("left",), noise=0.0)
+    clicking.solve(points)
+    assert clicking.result is not None
+    for found, true in zip(clicking.scene.arms, sequence.scene.arms, strict=True):
+        np.testing.assert_allclose(found.T_world_base, true.T_world_base, atol=1e-5)
+    calibration = Calibration.of(sequence.scene)
+    deviations = clicking.result.deviations
+    refined = Calibrated(calibration, StopReason.CONVERGED, 0.5, 0.25, deviations, (), "", "", "", "")
+    report = report_of(refined, clicking, points)
+    assert not report.objection and not report.disagreeing
+    assert report.after == pytest.approx([0.0] * len(points), abs=0.01)
+    clicking.solve(clicked(there, sequence.measured, (0, 1), ("left",), noise=0.0))
+    assert clicking.result is None and "moves between frames" in clicking.problem
