@@ -35,6 +35,14 @@ class Step(StrEnum):
 
 
 @dataclass(frozen=True)
+class ClickedPoint(ImagePoint):
+    """A clicked point; its frame is identified by the id, since indices change with the options of the import."""
+
+    frame_id: str = ""
+    """Id of the frame; empty in drafts of earlier versions, whose index is used."""
+
+
+@dataclass(frozen=True)
 class Draft:
     """Choices of the user in New recording; immutable."""
 
@@ -44,7 +52,7 @@ class Draft:
     name: str = ""
     """Name of the sequence; by default that of the source."""
     options: ImportOptions = field(default_factory=ImportOptions)
-    points: tuple[ImagePoint, ...] = ()
+    points: tuple[ClickedPoint, ...] = ()
     """Clicked points, in order."""
     focal_length: bool = False
     """Whether the focal length is also estimated."""
@@ -84,8 +92,17 @@ class Draft:
         return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
 
     def with_options(self, **changes: Any) -> "Draft":
-        """The draft with changed options and without its calibration; clicked points are kept."""
-        return self.uncalibrated(options=replace(self.options, **changes))
+        """The draft with changed options and without its calibration; points of cameras with other images or another
+        calibration are removed."""
+        options = replace(self.options, **changes)
+
+        def unchanged(camera: str) -> bool:
+            return all(
+                getattr(options, part).get(camera) == getattr(self.options, part).get(camera) for part in _CAMERA_PARTS
+            )
+
+        points = tuple(point for point in self.points if unchanged(point.camera))
+        return self.uncalibrated(options=options, points=points)
 
 
 @dataclass(frozen=True)
@@ -179,6 +196,8 @@ _OF_TABLES = (
     *("time_offset", "arm_time_offset", "row_rate", "frame_rate"),
 )
 """Options that only a table of kinematics has."""
+_CAMERA_PARTS = ("images", "calibration", "calibration_size")
+"""Options of each camera, which determine its undistorted images."""
 _NUMBERS = ("time_offset", "frame_rate", "row_rate", "tool_point")
 _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
@@ -218,8 +237,7 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
         chosen = {role: column for role, column in draft.options.columns.items() if column != which}
         options["columns"] = _columns(draft.with_options(columns=chosen), value, which, guessed) if value else chosen
     elif name == "remove-camera":
-        for known in ("images", "calibration", "calibration_size"):
-            options[known] = _with(getattr(draft.options, known), value, "")
+        options |= {part: _with(getattr(draft.options, part), value, "") for part in _CAMERA_PARTS}
     return draft.with_options(**options) if options else None
 
 
@@ -237,7 +255,8 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
             return replace(Draft(), source=str(path), name=recording_name(path), step=Step.CHECK)
         case "images":
             images = options.images or {name: str(place) for name, place in found.items()}
-            return draft.with_options(images={**images, which or _new_name(images, path): str(path)})
+            named = replace(draft, options=replace(options, images=images))
+            return named.with_options(images={**images, which or _new_name(images, path): str(path)})
         case "calibration":
             return draft.with_options(calibration={**options.calibration, which: path})
         case "kinematics":

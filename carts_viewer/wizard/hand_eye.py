@@ -35,7 +35,7 @@ from carts_viewer.wizard.calibration import (
     report_of,
     target_folder,
 )
-from carts_viewer.wizard.draft import Draft
+from carts_viewer.wizard.draft import ClickedPoint, Draft
 from carts_viewer.wizard.drawing import Drawing, drawing_of
 from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras
 
@@ -188,14 +188,39 @@ class HandEyeStep:
         )
         self._host.document.show(content, "side")
 
+    def matched(self, draft: Draft) -> Draft:
+        """The draft with the current frame indices of its points; points without a frame, camera or arm are removed,
+        with a `problem`."""
+        scene, ids = self._sequence.scene, self._sequence.frame_ids
+        rows = {frame_id: row for row, frame_id in enumerate(ids)}
+        marks = {arm.name: self._clicking.names(arm.name) for arm in scene.arms}
+        cameras = {camera.name for camera in scene.cameras}
+        points = []
+        for point in draft.points:
+            frame_id = point.frame_id or (ids[point.frame] if 0 <= point.frame < len(ids) else "")
+            if frame_id in rows and point.camera in cameras and point.landmark in marks.get(point.arm, ()):
+                points.append(replace(point, frame=rows[frame_id], frame_id=frame_id))
+        if removed := len(draft.points) - len(points):
+            self.problem = (
+                f"{counted(removed, 'point')} {'was' if removed == 1 else 'were'} removed, since the frame, camera or "
+                "arm is no longer part of the recording. Click other points."
+            )
+            return draft.uncalibrated(points=tuple(points))
+        return replace(draft, points=tuple(points))
+
     def clicked(self, draft: Draft, u: float, v: float) -> Draft:
         """The draft with the prompted point at a position relative to the image size; unchanged without a prompt."""
         prompt, self.problem = self.prompt(draft), ""
         if prompt is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
             return draft
         camera = self._sequence.scene.camera(prompt.camera)
-        point = ImagePoint(
-            prompt.frame, prompt.camera, prompt.arm, prompt.landmark, (u * camera.width, v * camera.height)
+        point = ClickedPoint(
+            prompt.frame,
+            prompt.camera,
+            prompt.arm,
+            prompt.landmark,
+            (u * camera.width, v * camera.height),
+            self._sequence.frame_ids[prompt.frame],
         )
         if self._wanted == prompt:
             self._wanted = None

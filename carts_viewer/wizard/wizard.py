@@ -9,6 +9,7 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.model.scene import Scene
 from carts_core.recording.image_sources import VIDEO_SUFFIXES
 from carts_core.recording.importing.delays import open_recording
+from carts_core.wording import counted
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import render
@@ -162,6 +163,11 @@ class RecordingWizard:
         """Replace the draft as an undo step."""
         if draft == self._draft:
             return
+        if draft.step is Step.CHECK and (removed := len(self._draft.points) - len(draft.points)):
+            self._problem = (
+                f"{counted(removed, 'clicked point')} of the previous images or calibration removed. Undo restores the "
+                "points."
+            )
         self._undo = [*self._undo, self._draft][-_MAX_UNDO:]
         self._change(draft)
 
@@ -290,6 +296,7 @@ class RecordingWizard:
                     raise SettingsError(next(iter(found.problems.values()), "the recording cannot be read."))
                 self._show_message("Hand-eye", "Opening the images …", "side")
                 self._step = HandEyeStep(self._host, found.recording, self._draft, self._calibrated)
+                self._change(self._step.matched(self._draft))
             except CartsError as error:
                 self._problem = problem_of(error)
                 self._change(replace(self._draft, step=Step.CHECK))

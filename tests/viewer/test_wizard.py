@@ -4,8 +4,8 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,15 +28,16 @@ from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import ImagePredictor, StopReason
-from carts_core.optimization.hand_eye import PoseDeviation
+from carts_core.optimization.hand_eye import ImagePoint, PoseDeviation
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
+from carts_core.settings.interchange import ImportOptions
 from carts_viewer.jobs.solver_process import SolverInProcess
 from carts_viewer.start.site import Site
 from carts_viewer.wizard import hand_eye
 from carts_viewer.wizard.calibration import CalibrationJob
 from carts_viewer.wizard.check import Guess, check_form, guess
-from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed
+from carts_viewer.wizard.draft import ClickedPoint, Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.wizard import RecordingWizard
 
 FRAMES = 6
@@ -174,6 +175,47 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Pa
         assert chosen("undo") is None
 
 
+@pytest.mark.parametrize("offset", [-1.3, 1.3])
+def test_points_stay_in_their_images_when_a_time_offset_drops_frames(
+    tmp_path: Path, shipped_psm: Robot, offset: float
+) -> None:
+    folder = write_swaying(tmp_path / "labs" / "run", shipped_psm, 3, 1.5).parent
+    (folder / "sequence.toml").unlink()
+    draft = Draft(Step.HAND_EYE, str(folder), "run", ImportOptions(time_offset=0.0))
+    last = len(ids_of(draft)) - 1
+    points = [ImagePoint(frame, "left", "PSM1", "tip", (9.0, 9.0)) for frame in (0, 20, last)]
+    file = DraftFile()
+    file.write(replace(draft, points=drafted(points)))
+    with Site([tmp_path / "labs"], port=0) as site:
+        site.post(lambda: site.show_recording(file.key))
+        place = place_of(site)
+        before = [point.frame_id for point in place.draft.points]
+        for name, value in (("back", ""), ("time_offset", str(offset)), ("continue", "")):
+            site.post(lambda name=name, value=value: place.choose(name, value))
+        site.wait()
+        assert "1 point was removed, since the frame" in site.document.content
+        kept = place.draft.points
+    ids = ids_of(place.draft)
+    assert [point.frame_id for point in kept] == (before[1:] if offset < 0 else before[:-1])
+    assert len(ids) < last and [ids[point.frame] for point in kept] == [point.frame_id for point in kept]
+
+
+def ids_of(draft: Draft) -> tuple[str, ...]:
+    found = guess(draft).recording
+    assert found is not None
+    return found.frame_ids
+
+
+def test_points_are_removed_with_the_images_or_the_calibration_of_their_camera_only() -> None:
+    left, right = (ClickedPoint(0, camera, "PSM1", "tip", (9.0, 9.0), "1") for camera in ("left", "right"))
+    found = {"left": Path("/run/left"), "right": Path("/run/right")}
+    draft = Draft(source="/run", points=(left, right))
+    assert picked(draft, "calibration left", Path("/run/left.yaml"), found).points == (right,)
+    assert picked(draft, "images right", Path("/run/other"), found).points == (left,)
+    assert picked(draft, "images", Path("/run/third"), found).points == (left, right)
+    assert after(draft, ("calibration_size right", "64x48"))[0].points == (left,)
+
+
 # ---- Calibrations; this part stands for any step of the optimizer ---------------------------------------------------
 
 
@@ -216,6 +258,11 @@ def jobs(monkeypatch: pytest.MonkeyPatch) -> list[CalibrationJob]:
     return begun
 
 
+def drafted(points: Iterable[ImagePoint]) -> tuple[ClickedPoint, ...]:
+    """Points as in a draft of an earlier version, with the indices of their frames only."""
+    return tuple(ClickedPoint(**asdict(point)) for point in points)
+
+
 def open_calibration(folder: Path, made: Sequence, seen: Scene) -> tuple[Path, str]:
     """Write a recording whose points were clicked as in a scene, and its draft; returns root and key of the draft."""
     (folder / "labs" / "day" / "left").mkdir(parents=True)
@@ -227,7 +274,7 @@ def open_calibration(folder: Path, made: Sequence, seen: Scene) -> tuple[Path, s
     write_lab_files(folder / "labs" / "day", range(len(made)), made.measured["PSM1"], [("left", (320, 240), K)])
     points = clicked(seen, made.measured, range(len(made)), ("left",), noise=0.5)
     file = DraftFile()
-    file.write(Draft(Step.HAND_EYE, str(folder / "labs" / "day"), "day", points=tuple(points)))
+    file.write(Draft(Step.HAND_EYE, str(folder / "labs" / "day"), "day", points=drafted(points)))
     return folder / "labs", file.key
 
 
@@ -305,6 +352,17 @@ def test_a_calibration_is_stopped_at_any_moment(
     monkeypatch.setattr(optimization, "CalibrationOptimizer", Stopped)
     site.post(lambda: place.choose(*CALIBRATE))
     assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None
+
+
+def test_points_of_another_calibration_are_removed_with_a_message(site: Site) -> None:
+    place = place_of(site)
+    for name, value in (("back", ""), ("calibration_size left", "320x240")):
+        site.post(lambda name=name, value=value: place.choose(name, value))
+    site.wait()
+    assert "12 clicked points of the previous images or calibration removed." in site.document.content
+    assert not place.draft.points
+    site.post(lambda: place.choose("undo", ""))
+    assert len(place_of(site).draft.points) == 12
 
 
 def test_few_points_are_called_ambiguous_until_a_calibration_is_kept(site: Site, jobs: list[CalibrationJob]) -> None:
