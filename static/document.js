@@ -125,7 +125,7 @@
     if (below) below.inert = covered; // the keyboard does not reach the covered view
   }
 
-  // A click in the image is a press without motion.
+  // A click in the image is a press without motion; it reports the name (`data-click`) that was shown at the press.
   let pressed = null;
   const canvas = () => window.__viserMutable?.canvas;
 
@@ -138,17 +138,18 @@
   }
 
   window.addEventListener("pointerdown", (event) => {
-    pressed = event.button === 0 && !event.shiftKey && event.target === canvas() ? [event.clientX, event.clientY] : null;
+    const name = box?.querySelector("[data-click]")?.dataset.click;
+    pressed = name && event.button === 0 && !event.shiftKey && event.target === canvas() ? [event.clientX, event.clientY, name] : null;
   }, { capture: true });
-  window.addEventListener("pointerup", (event) => {
+  window.addEventListener("click", (event) => {
     const start = pressed;
     pressed = null;
-    if (!start || Math.hypot(event.clientX - start[0], event.clientY - start[1]) > 3) return;
-    const box = imageBox();
-    if (!box) return;
-    const u = (event.clientX - box.left) / box.width;
-    const v = (event.clientY - box.top) / box.height;
-    if (u >= 0 && u <= 1 && v >= 0 && v <= 1) window.carts.report("Clicked", { at: [u, v] });
+    if (!start || event.detail > 1) return; // the second click of a double click
+    const image = Math.hypot(event.clientX - start[0], event.clientY - start[1]) > 3 ? null : imageBox();
+    if (!image) return;
+    const u = (event.clientX - image.left) / image.width;
+    const v = (event.clientY - image.top) / image.height;
+    if (u >= 0 && u <= 1 && v >= 0 && v <= 1) say(start[2], `${u} ${v}`);
   }, { capture: true });
 
   // A document at the side ends where the canvas begins; viser changes the width of its panel.

@@ -396,7 +396,10 @@
       event.preventDefault();
       report("ShowFrame", { index: Number(frame.dataset.frame) });
     }, { capture: true });
-    window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
+    window.addEventListener("dblclick", (event) => {
+      // Clicks that place points do not change the view.
+      if (inPicture(event) && !painting(event) && !document.querySelector("[data-click]")) showEndoscope();
+    }, { capture: true });
   }
 
   // ---- Reports to the server: drawn overlays, and the end of drags -------------------------------------------------

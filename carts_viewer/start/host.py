@@ -20,9 +20,6 @@ class SitePage(Protocol):
     def choose(self, name: str, value: str) -> None:
         """Carry out a choice in the document; a tab can send arbitrary strings."""
 
-    def click(self, u: float, v: float) -> None:
-        """Handle a click in the image at (u, v), relative to its width and height; does nothing by default."""
-
     def fail(self, error: Exception) -> None:
         """Show an error."""
 

@@ -23,7 +23,7 @@ from carts_viewer.start.host import SitePage
 from carts_viewer.start.roots import Roots
 from carts_viewer.start.start_page import StartPage, remember
 from carts_viewer.transport.document import Document, render
-from carts_viewer.transport.events import Chosen, Clicked
+from carts_viewer.transport.events import Chosen
 from carts_viewer.transport.page import Page
 
 _log = logging.getLogger(__name__)
@@ -200,18 +200,15 @@ class Site:
     def _listen(self) -> None:
         """Prepare an empty page for documents."""
         self.page.server.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
-        self.page.listen(Chosen | Clicked, lambda _, event: self.post(lambda: self._dispatch(event)))
+        self.page.listen(Chosen, lambda _, event: self.post(lambda: self._dispatch(event)))
         self._listening = True
 
-    def _dispatch(self, event: Chosen | Clicked) -> None:
+    def _dispatch(self, event: Chosen) -> None:
         page = self.shown
         if page is None:
             return
         try:
-            if isinstance(event, Chosen):
-                page.choose(event.name, event.value)
-            else:
-                page.click(*event.at)
+            page.choose(event.name, event.value)
         except Exception as error:
             if not isinstance(error, CartsError):
                 _log.exception("Unexpected error in the page")

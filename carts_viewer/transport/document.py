@@ -1,7 +1,8 @@
 """A document over the page: HTML from the server, and the choices made in it.
 
 An element with `data-do="NAME"` reports a click (a button) or a change of its value (a list, a field) as
-`events.Chosen`. The handler checks name and value, since a tab can send arbitrary strings.
+`events.Chosen`. With an element `data-click="NAME"`, a click in the image reports NAME and its `position`. The handler
+checks name and value, since a tab can send arbitrary strings.
 """
 
 import functools
@@ -51,6 +52,15 @@ class Document:
 
     def _send(self, client: viser.ClientHandle) -> None:
         call(client, "showDocument", *self._shown)
+
+
+def position(value: str) -> tuple[float, float] | None:
+    """Position "U V" of a choice, relative to the image size; None if it is malformed or outside of the image."""
+    try:
+        u, v = map(float, value.split())
+    except ValueError:
+        return None
+    return (u, v) if 0.0 <= u <= 1.0 and 0.0 <= v <= 1.0 else None
 
 
 def escaped(value: Any) -> str:

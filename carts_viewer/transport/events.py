@@ -76,12 +76,6 @@ class Dragged(Event):
     end: _Point
 
 
-class Clicked(Event):
-    """The shown image was clicked."""
-
-    at: _Point
-
-
 class Chosen(Event):
     """A value was chosen in the document over the page."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
 from carts_core.optimization import StopReason
-from carts_core.optimization.hand_eye import HandEyeResult, ImagePoint
+from carts_core.optimization.hand_eye import HandEyeResult
 from carts_core.recording import Sequence, evenly_spaced
 from carts_core.recording.importing.delays import open_recording
 from carts_core.recording.importing.found import FoundRecording
@@ -22,7 +22,7 @@ from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.start.host import Host
 from carts_viewer.state import NETWORK
-from carts_viewer.transport.document import render
+from carts_viewer.transport.document import position, render
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.calibration import (
     CALIBRATION_FRAMES,
@@ -173,7 +173,7 @@ class HandEyeStep:
         """Update picture and panel."""
         self._solve(draft)
         prompt = self.prompt(draft)
-        at = prompt or (self._clicking.plan[0] if not draft.points else _prompt_of(draft.points[-1]))
+        at = prompt or (self._clicking.plan[0] if not draft.points else ClickPrompt.of(draft.points[-1]))
         self._picture.show(at.frame, at.camera, self.shown_scene(draft))
         content = hand_eye_panel(
             draft,
@@ -208,10 +208,9 @@ class HandEyeStep:
             return draft.uncalibrated(points=tuple(points))
         return replace(draft, points=tuple(points))
 
-    def clicked(self, draft: Draft, u: float, v: float) -> Draft:
-        """The draft with the prompted point at a position relative to the image size; unchanged without a prompt."""
-        prompt, self.problem = self.prompt(draft), ""
-        if prompt is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
+    def _clicked(self, draft: Draft, prompt: ClickPrompt, value: str) -> Draft:
+        """The draft with the prompted point at a position."""
+        if (at := position(value)) is None:
             return draft
         camera = self._sequence.scene.camera(prompt.camera)
         point = ClickedPoint(
@@ -219,12 +218,12 @@ class HandEyeStep:
             prompt.camera,
             prompt.arm,
             prompt.landmark,
-            (u * camera.width, v * camera.height),
+            (at[0] * camera.width, at[1] * camera.height),
             self._sequence.frame_ids[prompt.frame],
         )
         if self._wanted == prompt:
             self._wanted = None
-        kept = tuple(each for each in draft.points if _prompt_of(each) != prompt)
+        kept = tuple(each for each in draft.points if ClickPrompt.of(each) != prompt)
         self._progress = None
         return draft.uncalibrated(points=(*kept, point))
 
@@ -244,10 +243,13 @@ class HandEyeStep:
             self._wanted = None
         elif name == "skip-frame" and prompt is not None:
             self._skip_frame(draft, prompt)
+        elif kind == "click":
+            # A click on an earlier document is not one of the current prompt.
+            return self._clicked(draft, prompt, value) if prompt is not None and prompt.key == which else draft
         elif kind == "look":
             self._look(prompt or self._clicking.plan[-1], which, value)
         elif name == "show-point" and (row := _row(value, draft)) is not None:
-            self._wanted = _prompt_of(draft.points[row])
+            self._wanted = ClickPrompt.of(draft.points[row])
         elif name == "calibrate":
             self._calibrate()
         else:
@@ -268,22 +270,18 @@ class HandEyeStep:
         elif kind == "move-point" and (row := _row(which, draft)) is not None:
             draft = self._moved(draft, row, value)
         elif name == "remove-point" and (row := _row(value, draft)) is not None:
-            self._wanted = _prompt_of(draft.points[row])
+            self._wanted = ClickPrompt.of(draft.points[row])
             draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
         return draft
 
     def _moved(self, draft: Draft, row: int, value: str) -> Draft:
-        """The draft with a point at another position, "U V" relative to the image size."""
+        """The draft with a point at another position."""
         point = draft.points[row]
         camera = self._sequence.scene.camera(point.camera)
-        try:
-            u, v = map(float, value.split())
-        except ValueError:
-            return draft
-        if not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
+        if (at := position(value)) is None:
             return draft
         self._progress = None
-        moved = replace(point, pixel=(u * camera.width, v * camera.height))
+        moved = replace(point, pixel=(at[0] * camera.width, at[1] * camera.height))
         return draft.uncalibrated(points=(*draft.points[:row], moved, *draft.points[row + 1 :]))
 
     def write(self, draft: Draft) -> Path:
@@ -409,7 +407,3 @@ class HandEyeStep:
 def _row(value: str, draft: Draft) -> int | None:
     """Index of a clicked point in a choice; None if there is no such point."""
     return int(value) if value.isdecimal() and len(value) < 9 and int(value) < len(draft.points) else None
-
-
-def _prompt_of(point: ImagePoint) -> ClickPrompt:
-    return ClickPrompt(point.camera, point.frame, point.arm, point.landmark)

@@ -36,6 +36,16 @@ class ClickPrompt:
     arm: str
     landmark: str
 
+    @staticmethod
+    def of(point: ImagePoint) -> "ClickPrompt":
+        """The prompt of a point."""
+        return ClickPrompt(point.camera, point.frame, point.arm, point.landmark)
+
+    @property
+    def key(self) -> str:
+        """Unique name of the prompt; names of cameras and arms do not contain slashes."""
+        return f"{self.camera}/{self.frame}/{self.arm}/{self.landmark}"
+
 
 class Clicking:
     """The planned points, the next point to click, and the calibration computed from clicked points.
@@ -67,7 +77,7 @@ class Clicking:
 
     def next_prompt(self, points: Rows[ImagePoint], skipped: frozenset[ClickPrompt]) -> ClickPrompt | None:
         """The first prompt that is neither clicked nor skipped; None if there is none."""
-        done = {ClickPrompt(point.camera, point.frame, point.arm, point.landmark) for point in points} | skipped
+        done = {ClickPrompt.of(point) for point in points} | skipped
         return next((prompt for prompt in self.plan if prompt not in done), None)
 
     def move_frame(self, camera: str, frame: int, other: int) -> None:

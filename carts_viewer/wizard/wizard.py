@@ -140,13 +140,6 @@ class RecordingWizard:
                 columns = self._guess.columns if self._guess else {}
                 self._set(changed(self._draft, name, value, columns) or self._draft)
 
-    def click(self, u: float, v: float) -> None:
-        """Place the prompted point."""
-        if self._step is not None and self._draft.step is Step.HAND_EYE:
-            self._problem = ""
-            self._set(self._step.clicked(self._draft, u, v))
-            self.show()
-
     def fail(self, error: Exception) -> None:
         """Show an error."""
         self._problem = (problem_of(error) if isinstance(error, CartsError) else str(error)) or type(error).__name__

@@ -22,6 +22,7 @@ from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_viewer.start.site import Site
+from carts_viewer.wizard.draft import Draft, DraftFile, Step
 from carts_viewer.wizard.wizard import RecordingWizard
 
 pytestmark = pytest.mark.browser
@@ -62,6 +63,7 @@ def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, 
         )
         point = next(point for point in points if point.arm == prompt.arm)
         before = len(place.draft.points)
+        visitor.page.locator(f'[data-click="click {prompt.key}"]').wait_for()
         visitor.point_at(point.pixel, (camera.width, camera.height))
         eventually(lambda: len(place_of(visitor).draft.points), lambda count, before=before: count == before + 1)
     raise AssertionError("there is no end to what is asked for")
@@ -110,6 +112,35 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.page.get_by_role("button", name="All recordings", exact=True).click()
     visitor.reads("0 of 4 frames reviewed")
     assert not (data_dir() / "drafts").exists() or not list((data_dir() / "drafts").glob("*.json"))
+
+
+@pytest.fixture
+def hand_eye(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
+) -> Iterator[tuple[Visitor, RecordingWizard]]:
+    """At the step Hand-eye, without points."""
+    made = Sequence.open(tiny_sequence(frames=2, width=320, height=240))
+    folder = tmp_path / "labs" / "day 3"
+    shutil.copytree(made.path.parent / "regular" / "left", folder / "left_images")
+    (left,) = made.scene.cameras
+    write_lab_files(folder, range(1, 3), made.measured["PSM1"], [("left", (320, 240), left.K - SHIFT)])
+    file = DraftFile()
+    file.write(Draft(Step.HAND_EYE, str(folder), "day 3"))
+    visitor = visit(folder.parent)
+    visitor.site.post(lambda: visitor.site.show_recording(file.key))
+    visitor.reads("Click the tip")
+    dismiss_warning(visitor.page)
+    yield visitor, place_of(visitor)
+
+
+def test_a_double_click_places_one_point(hand_eye: tuple[Visitor, RecordingWizard]) -> None:
+    visitor, place = hand_eye
+    wait_in(visitor.page, "window.carts && carts.imageOnScreen()")
+    for count in (1, 2):
+        visitor.page.locator("canvas[data-engine]").dblclick(position={"x": 200 + 100 * count, "y": 360})
+        visitor.page.locator(".clicks tr").nth(count).wait_for()
+        visitor.page.wait_for_timeout(500)
+        assert len(place.draft.points) == count
 
 
 def agreement(found: Scene, truth: Sequence, camera: str) -> float:

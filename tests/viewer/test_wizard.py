@@ -354,6 +354,18 @@ def test_a_calibration_is_stopped_at_any_moment(
     assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None
 
 
+def test_two_clicks_on_the_same_prompt_place_one_point(site: Site) -> None:
+    place = place_of(site)
+    for _ in range(2):
+        site.post(lambda: place.choose("remove-point", "0"))
+    place_of(site)
+    assert place.prompt is not None and place.prompt.key in site.document.content
+    for at in ("0.5 0.5", "0.6 0.5", "nan 2"):
+        site.post(lambda key=place.prompt.key, at=at: place.choose(f"click {key}", at))
+    points = place_of(site).draft.points
+    assert len(points) == 11 and points[-1].pixel == (160.0, 120.0)
+
+
 def test_points_of_another_calibration_are_removed_with_a_message(site: Site) -> None:
     place = place_of(site)
     for name, value in (("back", ""), ("calibration_size left", "320x240")):
