@@ -1,7 +1,7 @@
 """Calibration in *New recording*: the job, its report, and the recording with its result."""
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from collections.abc import Sequence as Rows
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -118,10 +118,10 @@ class CalibrationJob:
         return None if self.cancelled else reply.result()
 
 
-def as_plain(scene: Scene) -> dict[str, Any]:
-    """A calibration as stored in a draft."""
+def as_plain(scene: Scene, calibrated: Collection[str]) -> dict[str, Any]:
+    """A calibration as stored in a draft, with the base frames of the calibrated arms."""
     return {
-        "arms": {arm.name: arm.T_world_base.tolist() for arm in scene.arms},
+        "arms": {arm.name: arm.T_world_base.tolist() for arm in scene.arms if arm.name in calibrated},
         "cameras": {camera.name: camera.T_camera_world.tolist() for camera in scene.cameras},
         "intrinsics": {camera.name: list(camera.intrinsics) for camera in scene.cameras},
     }
@@ -214,9 +214,12 @@ def _poses(
     result: Calibrated, before: Scene, after: Scene, clicking: Clicking, points: Rows[ImagePoint]
 ) -> tuple[PoseReport, ...]:
     """Change of the pose of each arm in each camera."""
+    assert clicking.result is not None
     frames = sorted({point.frame for point in points})
     poses = []
     for (name, camera), deviation in result.deviations.items():
+        if name not in clicking.result.base_covariances:
+            continue
         robot = before.arm(name).robot
         middle = robot.forward_kinematics(clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
         old, new = (scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base for scene in (before, after))
@@ -229,10 +232,10 @@ def _poses(
 def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
     """The scene with a calibration (`as_plain`); `SettingsError` if malformed or of other arms or cameras."""
     try:
-        arms = tuple(
-            replace(arm, T_world_base=rigid_transform(calibration["arms"][arm.name], f"T_world_base of {arm.name}"))
-            for arm in scene.arms
-        )
+        frames = {name: rigid_transform(T, f"T_world_base of {name}") for name, T in calibration["arms"].items()}
+        arms = tuple(replace(arm, T_world_base=frames.pop(arm.name, arm.T_world_base)) for arm in scene.arms)
+        if frames:
+            raise KeyError(*frames)
         cameras = tuple(
             replace(
                 camera,
@@ -241,7 +244,7 @@ def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
             )
             for camera in scene.cameras
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise SettingsError("the calibration belongs to other arms or cameras. Calibrate again.") from error
     return replace(scene, arms=arms, cameras=cameras)
 
@@ -249,22 +252,32 @@ def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
 def calibrated_recording(
     recording: FoundRecording, before: Scene, calibration: Mapping[str, Any], text: str
 ) -> FoundRecording:
-    """The recording with a calibration (`as_plain`) instead of placeholders; errors are those of `calibrated_scene`.
+    """The recording with a calibration (`as_plain`) instead of placeholders, which uncalibrated arms keep; errors are
+    those of `calibrated_scene`.
 
     Args:
         before: scene of the recording.
         text: origin of the calibration, for the report.
     """
     scene = calibrated_scene(before, calibration)
-    arms = tuple(replace(arm, T_world_base=scene.arm(arm.name).T_world_base, base_from=text) for arm in recording.arms)
+    arms = tuple(
+        replace(arm, T_world_base=scene.arm(arm.name).T_world_base, base_from=text)
+        if arm.name in calibration["arms"]
+        else arm
+        for arm in recording.arms
+    )
+    replaced = {(name, "T_world_base") for name in calibration["arms"]}
     cameras = []
     for camera in recording.cameras:
-        found = scene.camera(camera.name)
+        old, found = before.camera(camera.name), scene.camera(camera.name)
         placed = replace(camera, T_camera_world=found.T_camera_world)
-        if not np.allclose(found.intrinsics, before.camera(camera.name).intrinsics, rtol=1e-9, atol=0.0):
+        if not np.allclose(found.T_camera_world, old.T_camera_world, rtol=0.0, atol=1e-9):
+            replaced.add((camera.name, "T_camera_world"))
+        if not np.allclose(found.intrinsics, old.intrinsics, rtol=1e-9, atol=0.0):
             placed = replace(placed, intrinsics=found.intrinsics, pixel_center=0.5)
+            replaced.add((camera.name, "intrinsics"))
         cameras.append(placed)
-    notes = [note for note in recording.notes if note.placeholder != "T_world_base"]
+    notes = [note for note in recording.notes if (note.about, note.placeholder) not in replaced]
     return replace(recording, arms=arms, cameras=tuple(cameras), notes=(*notes, Note("found", f"calibration: {text}.")))
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as Rows
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
@@ -80,9 +81,15 @@ def hand_eye_panel(
     progress: CalibrationProgress | None,
     problem: str,
     folder: str,
+    placeholders: Rows[str],
     undoable: bool,
 ) -> str:
-    """HTML of the panel of the Hand-eye step; `shown` has the frame and camera of the image."""
+    """HTML of the panel of the Hand-eye step.
+
+    Args:
+        shown: frame and camera of the image.
+        placeholders: arms with a placeholder pose.
+    """
     report, result = draft.report, clicking.result
     camera = clicking.sequence.scene.camera(shown.camera)
     clicked = {point.frame for point in draft.points if point.camera == shown.camera}
@@ -99,6 +106,7 @@ def hand_eye_panel(
         running=progress is not None and not progress.ended,
         problem=problem,
         folder=folder,
+        placeholders=placeholders,
         undoable=undoable,
         calibration_frames=CALIBRATION_FRAMES,
         done=len({(p.camera, p.frame, p.arm, p.landmark) for p in draft.points}),
@@ -184,6 +192,7 @@ class HandEyeStep:
             self._progress,
             self.problem,
             self._target(draft),
+            self._placeholders(draft),
             undoable,
         )
         self._host.document.show(content, "side")
@@ -294,7 +303,7 @@ class HandEyeStep:
             text = f"{count} points clicked in carts view, and a calibration on {CALIBRATION_FRAMES} frames"
             calibration = draft.calibration
         elif self._clicking.result is not None:
-            text, calibration = f"{count} points clicked in carts view", as_plain(self._clicking.result.scene)
+            text, calibration = f"{count} points clicked in carts view", self._plain(self._clicking.scene)
         else:
             return write_sequence(replace(self._recording, name=draft.name), folder)
         recording = calibrated_recording(self._recording, self._sequence.scene, calibration, text)
@@ -393,9 +402,20 @@ class HandEyeStep:
             verdict = f" {report.verdict.capitalize()}: {report.reason}" if report.verdict else ""
             self._progress = CalibrationProgress("", 0.0, error=text + verdict, ended=True)
             return draft
-        self._progress, found = None, as_plain(result.calibration.applied_to(self._clicking.scene))
+        self._progress, found = None, self._plain(result.calibration.applied_to(self._clicking.scene))
         draft = draft.uncalibrated(report=report)
         return replace(draft, offered=found) if report.objection else replace(draft, calibration=found)
+
+    def _plain(self, scene: Scene) -> dict[str, Any]:
+        """A calibration as stored in a draft, with the base frames of the arms with points."""
+        result = self._clicking.result
+        return as_plain(scene, () if result is None else result.base_covariances)
+
+    def _placeholders(self, draft: Draft) -> list[str]:
+        """Arms that keep a placeholder pose."""
+        calibrated = (draft.calibration or self._plain(self._clicking.scene))["arms"]
+        notes = self._recording.notes
+        return [each.about for each in notes if each.placeholder == "T_world_base" and each.about not in calibrated]
 
     def _target(self, draft: Draft) -> str:
         try:

@@ -30,6 +30,7 @@ from carts_core.networks import FeatureExtractor
 from carts_core.optimization import ImagePredictor, StopReason
 from carts_core.optimization.hand_eye import ImagePoint, PoseDeviation
 from carts_core.recording import Sequence
+from carts_core.recording.importing.delays import open_recording
 from carts_core.rendering import Renderer
 from carts_core.settings.interchange import ImportOptions
 from carts_viewer.jobs.solver_process import SolverInProcess
@@ -214,6 +215,35 @@ def test_points_are_removed_with_the_images_or_the_calibration_of_their_camera_o
     assert picked(draft, "images right", Path("/run/other"), found).points == (left,)
     assert picked(draft, "images", Path("/run/third"), found).points == (left, right)
     assert after(draft, ("calibration_size right", "64x48"))[0].points == (left,)
+
+
+def test_an_arm_without_points_keeps_its_placeholder_pose_and_its_note(tmp_path: Path) -> None:
+    folder = tmp_path / "labs" / "rec"
+    header = [f"{arm}Joint{number}" for arm in ("PSM1", "PSM2") for number in range(1, 7)]
+    draft = replace(recording(folder, header, np.tile(JOINTS, 2)), step=Step.HAND_EYE, focal_length=True)
+    rows = np.tile(JOINTS, (FRAMES, 2)) * np.random.default_rng(0).uniform(0.4, 1.6, (FRAMES, 12))
+    np.savetxt(folder / "log.csv", rows, delimiter=",", header=",".join(header), comments="")
+    found = guess(draft).recording
+    assert found is not None
+    sequence, opened = open_recording(found)
+    with opened:
+        (camera,) = sequence.scene.cameras
+        fx, fy, cx, cy = camera.intrinsics
+        true = replace(sequence.scene, cameras=(replace(camera, intrinsics=(1.2 * fx, 1.2 * fy, cx, cy)),))
+        points = clicked(true, sequence.measured, range(4), (camera.name,), noise=0.01)
+    file = DraftFile()
+    file.write(replace(draft, points=drafted(point for point in points if point.arm == "PSM1")))
+    with Site([tmp_path / "labs"], port=0) as site:
+        site.post(lambda: site.show_recording(file.key))
+        place = place_of(site)
+        assert "PSM2: placeholder pose." in site.document.content
+        site.post(lambda: place.choose("save", ""))
+        app = eventually(lambda: site.app, lambda now: now is not None)
+        assert app is not None
+        text = app.sequence.path.read_text()
+    assert text.count("Base frame: 16 points clicked in carts view.") == 1
+    assert text.count("Base frame: a placeholder in front of the camera.") == 1
+    assert "PSM2: no base frame" in text and "PSM1: no base frame" not in text and "no calibration" not in text
 
 
 # ---- Calibrations; this part stands for any step of the optimizer ---------------------------------------------------
