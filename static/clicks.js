@@ -6,11 +6,22 @@
   const STEP = 0.5; // of an arrow key [px of the image]
   const SLOP = 2; // motion that begins a drag [CSS px]
   let drag = null;
+  let nudge = null; // mark that is being moved by arrow keys
 
   const marks = () => document.querySelectorAll(".carts-document .mark");
   const place = (mark) => mark.dataset.at.split(" ").map(Number);
   const within = (value) => Math.min(Math.max(value, 0), 1);
-  const move = (mark, u, v) => window.carts.report("Chosen", { name: `move-point ${mark.dataset.row}`, value: `${within(u)} ${within(v)}` });
+  const report = (name, mark, u, v) => window.carts.report("Chosen", { name: `${name} ${mark.dataset.row}`, value: `${u} ${v}` });
+
+  /** Report the motion by arrow keys since the first one was pressed; documents wait until then. */
+  function endNudge() {
+    if (!nudge) return;
+    const { mark, start } = nudge;
+    const [u, v] = place(mark);
+    nudge = null;
+    report("shift-point", mark, u - start[0], v - start[1]);
+    window.carts.holdDocument(false);
+  }
 
   function placeMarks() {
     const box = marks().length ? window.carts.imageBox() : null;
@@ -38,7 +49,7 @@
   }, { capture: true });
   for (const kind of ["pointerup", "pointercancel"]) {
     window.addEventListener(kind, () => {
-      if (drag?.moved && kind === "pointerup") move(drag.mark, ...place(drag.mark));
+      if (drag?.moved && kind === "pointerup") report("move-point", drag.mark, ...place(drag.mark));
       else if (drag) drag.mark.dataset.at = drag.start.join(" ");
       drag = null;
     }, { capture: true });
@@ -48,15 +59,20 @@
     if (!mark) return;
     const [x, y] = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key] ?? [];
     if (x !== undefined) {
+      if (nudge?.mark !== mark) endNudge();
+      nudge ??= { mark, start: place(mark) };
+      window.carts.holdDocument(true);
       const [[u, v], [width, height]] = [place(mark), mark.dataset.size.split(" ").map(Number)];
       mark.dataset.at = `${within(u + x * STEP / width)} ${within(v + y * STEP / height)}`;
-      move(mark, ...place(mark));
     } else if (["Delete", "Backspace"].includes(event.key)) {
+      endNudge();
       window.carts.report("Chosen", { name: "remove-point", value: mark.dataset.row });
     } else return;
     event.preventDefault();
     event.stopPropagation();
   }, { capture: true });
+  window.addEventListener("keyup", endNudge, { capture: true });
+  window.addEventListener("blur", endNudge);
   (function everyFrame() {
     requestAnimationFrame(everyFrame);
     placeMarks();

@@ -40,9 +40,9 @@
         box.addEventListener(kind, (event) => event.stopPropagation());
       }
       // New content is shown after the release of the pointer, since a button that is replaced before gets no click.
-      box.addEventListener("pointerdown", () => { held = true; });
+      box.addEventListener("pointerdown", () => holdDocument(true));
       for (const kind of ["pointerup", "pointercancel"]) {
-        window.addEventListener(kind, () => setTimeout(release), { capture: true });
+        window.addEventListener(kind, () => setTimeout(() => holdDocument(false)), { capture: true });
       }
     }
     return box;
@@ -82,9 +82,10 @@
 
   const say = (name, value) => window.carts.report("Chosen", { name, value });
 
-  function release() {
-    held = false;
-    if (waiting) showDocument(...waiting);
+  /** Let new content wait, or show it. */
+  function holdDocument(on) {
+    held = on;
+    if (!on && waiting) showDocument(...waiting);
   }
 
   /** Replace the content; focus, text being typed and scroll positions are kept. */
@@ -164,5 +165,5 @@
     if (bar) bar.value = share;
   }
 
-  Object.assign(window.carts, { showDocument, setProgress, imageBox });
+  Object.assign(window.carts, { showDocument, holdDocument, setProgress, imageBox });
 })();

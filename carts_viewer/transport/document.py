@@ -54,10 +54,11 @@ class Document:
         call(client, "showDocument", *self._shown)
 
 
-def position(value: str) -> tuple[float, float] | None:
-    """Position "U V" of a choice, relative to the image size; None if it is malformed or outside of the image."""
+def position(value: str, origin: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float] | None:
+    """Position "U V" of a choice from an origin, relative to the image size; None if it is malformed or outside of the
+    image."""
     try:
-        u, v = map(float, value.split())
+        u, v = (start + float(part) for start, part in zip(origin, value.split(), strict=True))
     except ValueError:
         return None
     return (u, v) if 0.0 <= u <= 1.0 and 0.0 <= v <= 1.0 else None

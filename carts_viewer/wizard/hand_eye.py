@@ -278,16 +278,19 @@ class HandEyeStep:
             draft = draft.uncalibrated()
         elif kind == "move-point" and (row := _row(which, draft)) is not None:
             draft = self._moved(draft, row, value)
+        elif kind == "shift-point" and (row := _row(which, draft)) is not None:
+            draft = self._moved(draft, row, value, relative=True)
         elif name == "remove-point" and (row := _row(value, draft)) is not None:
             self._wanted = ClickPrompt.of(draft.points[row])
             draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
         return draft
 
-    def _moved(self, draft: Draft, row: int, value: str) -> Draft:
-        """The draft with a point at another position."""
+    def _moved(self, draft: Draft, row: int, value: str, *, relative: bool = False) -> Draft:
+        """The draft with a point at another position, or displaced if `relative`."""
         point = draft.points[row]
         camera = self._sequence.scene.camera(point.camera)
-        if (at := position(value)) is None:
+        before = (point.pixel[0] / camera.width, point.pixel[1] / camera.height)
+        if (at := position(value, before if relative else (0.0, 0.0))) is None:
             return draft
         self._progress = None
         moved = replace(point, pixel=(at[0] * camera.width, at[1] * camera.height))

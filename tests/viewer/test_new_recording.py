@@ -143,6 +143,28 @@ def test_a_double_click_places_one_point(hand_eye: tuple[Visitor, RecordingWizar
         assert len(place.draft.points) == count
 
 
+def test_a_held_arrow_key_moves_a_point_by_all_its_steps_as_one_undo_step(
+    hand_eye: tuple[Visitor, RecordingWizard],
+) -> None:
+    visitor, place = hand_eye
+    page = visitor.page
+    visitor.point_at((160.0, 120.0), (320, 240))
+    visitor.button("tip").click()
+    (point,) = place.draft.points
+    page.locator(".mark").focus()
+    for _ in range(20):
+        page.keyboard.down("ArrowRight")
+    page.keyboard.up("ArrowRight")
+    eventually(lambda: place.draft.points[0].pixel[0], lambda u: u == pytest.approx(point.pixel[0] + 10.0))
+    for _ in range(4):
+        page.keyboard.press("ArrowDown")
+    eventually(lambda: place.draft.points[0].pixel[1], lambda v: v == pytest.approx(point.pixel[1] + 2.0))
+    for _ in range(5):
+        visitor.site.post(lambda: place.choose("undo", ""))
+    visitor.site.wait()
+    assert place.draft.points == (point,)
+
+
 def agreement(found: Scene, truth: Sequence, camera: str) -> float:
     """Mean Dice of rendered masks of two calibrations over every third frame."""
     renderers = [Renderer(scene, cameras=[camera]) for scene in (found, truth.scene)]

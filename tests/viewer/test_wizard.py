@@ -396,6 +396,15 @@ def test_two_clicks_on_the_same_prompt_place_one_point(site: Site) -> None:
     assert len(points) == 11 and points[-1].pixel == (160.0, 120.0)
 
 
+def test_displacements_of_a_point_add_up(site: Site) -> None:
+    place = place_of(site)
+    (u, v), others = place.draft.points[0].pixel, place.draft.points[1:]
+    for by in ("0.01 0", "0.01 -0.02", "2 0", "0.1"):
+        site.post(lambda by=by: place.choose("shift-point 0", by))
+    points = place_of(site).draft.points
+    assert points[0].pixel == pytest.approx((u + 0.02 * 320, v - 0.02 * 240)) and points[1:] == others
+
+
 def test_points_of_another_calibration_are_removed_with_a_message(site: Site) -> None:
     place = place_of(site)
     for name, value in (("back", ""), ("calibration_size left", "320x240")):
