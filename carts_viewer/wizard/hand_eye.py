@@ -1,6 +1,8 @@
 """The Hand-eye step of New recording: clicked points, calibration, and saving."""
 
 import math
+import threading
+from collections import deque
 from collections.abc import Callable
 from collections.abc import Sequence as Rows
 from dataclasses import replace
@@ -383,8 +385,20 @@ class HandEyeStep:
             known_base_frames=known,
         )
 
+        newest: deque[CalibrationProgress] = deque(maxlen=1)
+        posted = threading.Event()
+
         def report(progress: CalibrationProgress) -> None:
-            self._host.post(lambda: self._proceed(progress))
+            newest.append(progress)
+            if not posted.is_set():
+                posted.set()
+                self._host.post(proceed)
+
+        def proceed() -> None:
+            # Cleared first: progress that is reported from here on is posted again.
+            posted.clear()
+            if newest:
+                self._proceed(newest.pop())
 
         self._job = CalibrationJob(self._host.optimizers.calibration(task), scene, report)
 

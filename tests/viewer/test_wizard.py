@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -39,6 +40,7 @@ from carts_viewer.wizard import hand_eye
 from carts_viewer.wizard.calibration import CalibrationJob
 from carts_viewer.wizard.check import Guess, check_form, guess
 from carts_viewer.wizard.draft import ClickedPoint, Draft, DraftFile, Step, changed, picked
+from carts_viewer.wizard.hand_eye import FramePicture
 from carts_viewer.wizard.wizard import RecordingWizard
 
 FRAMES = 6
@@ -414,6 +416,32 @@ def test_points_of_another_calibration_are_removed_with_a_message(site: Site) ->
     assert not place.draft.points
     site.post(lambda: place.choose("undo", ""))
     assert len(place_of(site).draft.points) == 12
+
+
+def test_a_stop_does_not_wait_for_all_steps_to_be_shown(
+    site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Steps(OneStep):
+        def __iter__(self) -> Iterator[SimpleNamespace]:
+            for _ in range(200):
+                yield from super().__iter__()
+
+    shown: list[int] = []
+
+    def show(_: FramePicture, index: int, *__: object) -> None:
+        shown.append(index)
+        time.sleep(0.2)
+
+    place = place_of(site)
+    monkeypatch.setattr(optimization, "CalibrationOptimizer", Steps)
+    monkeypatch.setattr(FramePicture, "show", show)
+    site.post(lambda: place.choose(*CALIBRATE))
+    eventually(lambda: bool(jobs))
+    jobs[-1].join(PATIENCE)
+    count = len(shown)
+    site.post(lambda: place.choose(*STOP))
+    site.wait()
+    assert len(shown) <= count + 2
 
 
 def test_few_points_are_called_ambiguous_until_a_calibration_is_kept(site: Site, jobs: list[CalibrationJob]) -> None:
