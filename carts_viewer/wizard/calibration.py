@@ -1,5 +1,6 @@
 """Calibration in *New recording*: the job, its report, and the recording with its result."""
 
+import os
 import threading
 from collections.abc import Callable, Collection, Mapping
 from collections.abc import Sequence as Rows
@@ -282,11 +283,22 @@ def calibrated_recording(
 
 
 def target_folder(roots: Roots, source: Path, name: str) -> Path:
-    """Folder for the sequence of a recording: beside the recording, or inside it if it is an allowed folder."""
+    """Folder for the sequence of a recording: beside the recording, or inside it if it is an allowed folder; in another
+    allowed folder if that one is read-only.
+
+    Raises:
+        SettingsError: the name is not a file name, or no folder is writable.
+    """
     if (fault := name_fault(name)) is not None:
         raise SettingsError(f"the name is {name!r}, {fault}. Choose another name.")
-    parent = source.parent if source not in roots.folders else source
-    folder = roots.checked(parent) / f"{name}_sequence"
+    beside = roots.checked(source.parent if source not in roots.folders else source)
+    parent = next((folder for folder in (beside, *roots.folders) if os.access(folder, os.W_OK | os.X_OK)), None)
+    if parent is None:
+        raise SettingsError(
+            f"{beside} and the allowed folders are read-only. Make one of them writable, or restart carts view with "
+            "another --root FOLDER."
+        )
+    folder = parent / f"{name}_sequence"
     number = 2
     while folder.exists() or folder.is_symlink():
         folder = parent / f"{name}_sequence_{number}"

@@ -1,6 +1,7 @@
 """New recording without a browser: its form, delays, and calibrations that are stopped, kept or offered."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from visitor import write_lab_files
 from waiting import PATIENCE, eventually
 
 from carts_core import optimization
+from carts_core.errors import SettingsError
 from carts_core.imaging.working_image import Window
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
@@ -35,9 +37,10 @@ from carts_core.recording.importing.delays import open_recording
 from carts_core.rendering import Renderer
 from carts_core.settings.interchange import ImportOptions
 from carts_viewer.jobs.solver_process import SolverInProcess
+from carts_viewer.start.roots import Roots
 from carts_viewer.start.site import Site
 from carts_viewer.wizard import hand_eye
-from carts_viewer.wizard.calibration import CalibrationJob
+from carts_viewer.wizard.calibration import CalibrationJob, target_folder
 from carts_viewer.wizard.check import Guess, check_form, guess
 from carts_viewer.wizard.draft import ClickedPoint, Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import FramePicture
@@ -444,6 +447,23 @@ def test_a_stop_does_not_wait_for_all_steps_to_be_shown(
     assert len(shown) <= count + 2
 
 
+def test_a_recording_in_a_read_only_folder_is_saved_in_the_next_allowed_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root may write to every folder, so the answer of the operating system is replaced."""
+    source, other = tmp_path / "labs" / "day", tmp_path / "results"
+    for folder in (source, other):
+        folder.mkdir(parents=True)
+    roots, read_only = Roots([source.parent, other]), {source.parent}
+    monkeypatch.setattr(os, "access", lambda folder, _: folder not in read_only)
+    assert target_folder(roots, source, "day") == other / "day_sequence"
+    (other / "day_sequence").mkdir()
+    assert target_folder(roots, source, "day") == other / "day_sequence_2"
+    read_only.add(other)
+    with pytest.raises(SettingsError, match=r"are read-only\. Make one of them writable"):
+        target_folder(roots, source, "day")
+
+
 def test_few_points_are_called_ambiguous_until_a_calibration_is_kept(site: Site, jobs: list[CalibrationJob]) -> None:
     place, text = place_of(site), "another pose, beyond the standard deviations, can fit these points equally well."
     assert text not in site.document.content
@@ -531,6 +551,7 @@ import json, sys, time
 from pathlib import Path
 
 import carts_core.cli.command_line
+from carts_viewer.start.roots import Roots
 from carts_viewer.start.site import Site
 
 RUNS = 'aria-label="Calibration"'
