@@ -26,6 +26,8 @@ from ...rendering import Renderer
 from ...resources import shipped_weights
 from ...settings import TrainingConfig
 from ..randomization.samples import Observer, to_uint8
+from .digests import recording_digest
+from .loop import checked_checkpoint
 from .training import TrainingResult
 
 JUDGING_STREAM = 2
@@ -289,11 +291,14 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
 
     Raises:
         SequenceError: the recording cannot be read.
+        SettingsError: `output` holds a run with another recording.
+        WeightsError: the checkpoint in `output` cannot be read.
         OutputError: `output` cannot be written to.
         BusyError: another run writes to `output`.
     """
     sequence = Sequence.open(recording)
     with locked_folder(output):
+        checked_checkpoint(output, {"recording_digest": recording_digest(sequence)})
         found = _write_backgrounds(sequence, output)
     default, samples, every = TrainingConfig(), given.validation_samples, given.validation_every
     robots = tuple(dict.fromkeys(arm.robot.urdf for arm in sequence.scene.arms))

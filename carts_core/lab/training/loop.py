@@ -111,6 +111,29 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
         ) from error
 
 
+def checked_checkpoint(folder: Path, settings: dict[str, Any], may_change: tuple[str, ...] = ()) -> Checkpoint | None:
+    """Read the checkpoint of a run with these settings; None without a checkpoint.
+
+    Settings that the checkpoint of an older version does not contain are not compared.
+
+    Raises:
+        SettingsError: the folder holds a run with other settings.
+        WeightsError: the checkpoint cannot be read.
+    """
+    checkpoint = load_checkpoint(folder)
+    if checkpoint is None:
+        return None
+    before = json.loads(checkpoint.config_json)
+    changed = [name for name, value in settings.items() if name not in may_change and before.get(name, value) != value]
+    if changed:
+        details = ", ".join(f"{name} was {before[name]} and is {settings[name]}" for name in changed)
+        raise SettingsError(
+            f"{folder} holds a run with other settings: {details}. Give the same settings to resume it, "
+            "or choose another output folder."
+        )
+    return checkpoint
+
+
 Batch = TypeVar("Batch")
 
 
@@ -152,17 +175,9 @@ class TrainingLoop:
         self._clock, self._worked = time.perf_counter(), time.process_time()
 
     def _resume(self, may_change: tuple[str, ...]) -> None:
-        checkpoint = load_checkpoint(self._output)
+        checkpoint = checked_checkpoint(self._output, json.loads(self._config_json), may_change)
         if checkpoint is None:
             return
-        before, now = json.loads(checkpoint.config_json), json.loads(self._config_json)
-        changed = [name for name in now if name not in may_change and before.get(name) != now[name]]
-        if changed:
-            details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
-            raise SettingsError(
-                f"{self._output} holds a run with other settings: {details}. Give the same settings to resume it, "
-                "or choose another output folder."
-            )
         checkpoint.restore(self._modules, self._optimizer)
         self.step, self.history = checkpoint.step, checkpoint.history
 

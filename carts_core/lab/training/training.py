@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -23,6 +24,7 @@ from ...settings import TrainingConfig
 from ...stopping import message_if_stopped
 from ...wording import counted
 from .cache import make_cache
+from .digests import run_digests
 from .loader import training_batches, validation_set
 from .loop import History, TrainingLoop
 from .tasks import Batch, task_of
@@ -176,8 +178,9 @@ class _Run:
         config = _with_architecture(config, self.network)
         self.config, self.output, self.task = config, output, task_of(config.network)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
+        self.settings = recorded_settings(config)
         self.loop = TrainingLoop(
-            output, self.network, config, config_json(config), _MAY_CHANGE, {"average": self.average}
+            output, self.network, config, json.dumps(self.settings), _MAY_CHANGE, {"average": self.average}
         )
         self.history = self.loop.history
 
@@ -198,7 +201,7 @@ class _Run:
             self._save(validation)
         examples = self.task.panels(self._averaged().folded(), tuple(part[:_EXAMPLES] for part in samples))
         folder = output_path(self.output, "report")
-        report = write_report(folder, json.loads(config_json(self.config)), self.history, self.task.columns, examples)
+        report = write_report(folder, self.settings, self.history, self.task.columns, examples)
         weights = weights_file(self.config, self.output)
         return TrainingResult(weights, report, validation, self.history.first, self.history.seconds)
 
@@ -267,7 +270,7 @@ class _Run:
         return max(scores[-patience:]) <= max(scores[:-patience])
 
     def _save(self, validation: dict[str, float]) -> None:
-        training = {"step": self.loop.step, "validation": validation, "config": json.loads(config_json(self.config))}
+        training = {"step": self.loop.step, "validation": validation, "config": self.settings}
         # The aspect ratio of the camera image is 4:3, as for an endoscope; training images are crops.
         field, stride = self.config.images.field_width, self._averaged().architecture.stride
         size = tuple(stride * max(round(side / stride), 1) for side in (field, 0.75 * field))
@@ -298,8 +301,8 @@ def weights_file(config: TrainingConfig, output: Path) -> Path:
     return output / f"{config.network}.safetensors"
 
 
-def config_json(config: TrainingConfig) -> str:
-    """Settings as JSON, with only the names of files, so that the files of a run can be moved."""
+def recorded_settings(config: TrainingConfig) -> dict[str, Any]:
+    """Settings as JSON values, with names and digests of files, so that the files of a run can be moved."""
     settings = asdict(config)
     settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]
@@ -308,4 +311,4 @@ def config_json(config: TrainingConfig) -> str:
     settings["images"]["photographs"] = folder.name if folder else None
     recording = config.images.recording
     settings["images"]["recording"] = recording.name if recording else None
-    return json.dumps(settings)
+    return json.loads(json.dumps(settings | run_digests(config)))

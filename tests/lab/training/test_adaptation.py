@@ -135,6 +135,20 @@ def test_early_stopping_keeps_the_best_weights(config: TrainingConfig, tmp_path:
     assert again.first == result.first == checkpoint.history.validations[0]
 
 
+def test_another_recording_of_the_same_name_does_not_resume_the_run(
+    config: TrainingConfig, tiny_sequence: Callable[..., Path], tmp_path: Path
+):
+    train(config, tmp_path / "adapted")
+    before = {path: path.read_bytes() for path in (tmp_path / "adapted").rglob("*.*")}
+    recording = tiny_sequence()
+    table, image = recording.parent / "kinematics.csv", recording.parent / "regular" / "left" / "001.png"
+    table.write_text(table.read_text().replace("0.15", "0.16"))
+    cv2.imwrite(str(image), np.zeros((72, 96, 3), np.uint8))
+    with pytest.raises(SettingsError, match=r"other settings: recording_digest was \w+ and is \w+\. .* another output"):
+        adapted_to(recording, tmp_path / "adapted", TrainingConfig())
+    assert {path: path.read_bytes() for path in (tmp_path / "adapted").rglob("*.*")} == before
+
+
 FIGURES = {"dice": 0.8, "dice_given": 0.5, "part_accuracy": 0.9, "normal_error_deg": 20.0, "tip_error": 2.7}
 FIGURES |= dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7)
 

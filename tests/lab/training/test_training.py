@@ -1,6 +1,7 @@
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,9 @@ from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.loop import CHECKPOINT_FILE, load_checkpoint, schedule
 from carts_core.lab.training.training import TrainingProgress, train
 from carts_core.networks import FeatureExtractor
-from carts_core.networks.weights import read_weights
+from carts_core.networks.network import FeatureNetwork
+from carts_core.networks.weights import read_weights, save_weights
+from carts_core.resources import shipped_robot
 from carts_core.settings import Architecture, SurfaceArchitecture, TrainingConfig
 
 SMALL = {
@@ -118,6 +121,35 @@ def test_going_on_with_other_settings_is_refused_by_name(tmp_path: Path):
     train(small_config(steps=1), tmp_path)
     with pytest.raises(SettingsError, match=r"learning_rate was 0\.01 and is 0\.5.*another output folder"):
         train(small_config(steps=10, learning_rate=0.5), tmp_path)
+
+
+def test_another_robot_or_start_of_the_same_name_is_refused(tmp_path: Path, small_network: FeatureNetwork):
+    for step, name in enumerate("ab"):
+        folder = shutil.copytree(shipped_robot().parent, tmp_path / name)
+        with (folder / "psm_lnd.urdf").open("a") as urdf:
+            urdf.write(f"<!-- {name} -->")
+        save_weights(small_network, folder / "start.safetensors", {"step": step}, (320, 240))
+
+    def config(robot: str, start: str) -> TrainingConfig:
+        robots = (tmp_path / robot / "psm_lnd.urdf",)
+        return small_config(steps=1, robots=robots, start=tmp_path / start / "start.safetensors")
+
+    train(config("a", "a"), tmp_path / "run")
+    (tmp_path / "a").rename(tmp_path / "moved")
+    train(config("moved", "moved"), tmp_path / "run")
+    with pytest.raises(SettingsError, match=r"settings: robots_digest was .* and is .*\. Give the same settings"):
+        train(config("b", "moved"), tmp_path / "run")
+    with pytest.raises(SettingsError, match=r"settings: start_digest was \w+ and is \w+\. Give the same settings"):
+        train(config("moved", "b"), tmp_path / "run")
+
+
+def test_the_run_of_an_older_version_without_digests_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as older:
+        older.setattr("carts_core.lab.training.training.run_digests", lambda _: {})
+        train(small_config(steps=1), tmp_path)
+    train(small_config(steps=2), tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None and checkpoint.step == 2
 
 
 @pytest.mark.slow
