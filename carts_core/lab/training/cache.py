@@ -28,6 +28,7 @@ from ...model.robot import Robot
 from ...networks.weights import tensor_bytes
 from ...settings import TrainingConfig
 from ..randomization import SurfaceGenerator, SurfaceSample
+from .digests import image_digests
 
 SHARD = 250
 """Images per shard."""
@@ -94,20 +95,22 @@ def make_cache(
     Raises:
         SettingsError: a shard was generated for other robots or image settings.
         WeightsError: a shard cannot be read.
+        RobotError: a robot cannot be loaded.
     """
-    wanted = shards(config.cached)
+    wanted, metadata = shards(config.cached), _metadata(config)
     missing = []
     for index in range(wanted):
         path = _path(folder, index)
         if not path.exists():
             missing.append(index)
-        elif _opened(path).metadata() != _settings(config):
+        # Shards of older versions contain no digests.
+        elif {**metadata, **(_opened(path).metadata() or {})} != metadata:
             raise SettingsError(
                 f"shard {path} was generated for other robots or image settings. Give another cache folder, or delete "
                 "the shards of this one."
             )
     progress((wanted - len(missing)) * SHARD, wanted * SHARD)
-    make = partial(_make, folder, config)
+    make = partial(_make, folder, config, metadata)
     with ExitStack() as stack:
         if missing and config.workers:
             pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(config.workers, _prepare))
@@ -130,10 +133,13 @@ def _opened(path: Path) -> Any:
         raise WeightsError(f"shard {path} cannot be read ({error}). Delete the file to generate it again.") from error
 
 
-def _settings(config: TrainingConfig) -> dict[str, str]:
-    """Metadata of a shard, with only the names of files, so that they can be moved."""
+def _metadata(config: TrainingConfig) -> dict[str, str]:
+    """Metadata of a shard, with names and digests of files, so that they can be moved."""
     settings = {"robots": config.robots, "images": asdict(config.images)}
-    return {"settings": json.dumps(settings, default=lambda path: path.name)}
+    return {
+        "settings": json.dumps(settings, default=lambda path: path.name),
+        "digests": json.dumps(image_digests(config)),
+    }
 
 
 def _path(folder: Path, index: int) -> Path:
@@ -149,7 +155,7 @@ def _prepare() -> None:
 _ROBOTS: dict[Path, Robot] = {}
 
 
-def _make(folder: Path, config: TrainingConfig, index: int) -> None:
+def _make(folder: Path, config: TrainingConfig, metadata: dict[str, str], index: int) -> None:
     for path in config.robots:
         if path not in _ROBOTS:
             _ROBOTS[path] = Robot.load(path)
@@ -162,7 +168,7 @@ def _make(folder: Path, config: TrainingConfig, index: int) -> None:
         "images": torch.frombuffer(bytearray(b"".join(parts)), dtype=torch.uint8),
         "offsets": torch.from_numpy(offsets),
     }
-    write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, _settings(config)))
+    write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, metadata))
 
 
 def _encoded(samples: list[SurfaceSample]) -> list[bytes]:

@@ -5,6 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from lab_robots import write_urdf
 
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import SurfaceGenerator, SurfaceSample
@@ -68,6 +69,18 @@ def test_a_cache_of_other_settings_is_refused(tmp_path: Path):
     make_cache(tmp_path, replace(settings, steps=13, seed=1))
     with pytest.raises(SettingsError, match=r"samples-00000.* other robots or image settings. Give another cache"):
         make_cache(tmp_path, replace(settings, images=replace(settings.images, blood=0.5)))
+
+
+def test_a_cache_of_another_robot_of_the_same_name_is_refused(tmp_path: Path):
+    for limit, name in enumerate("ab", start=1):
+        (tmp_path / name).mkdir()
+        write_urdf(tmp_path / name / "robot.urdf", {"joint": (-1.0, limit)})
+    settings = config(tmp_path, cached=4, robots=(tmp_path / "a" / "robot.urdf",))
+    make_cache(tmp_path, settings)
+    (tmp_path / "a").rename(tmp_path / "moved")
+    make_cache(tmp_path, replace(settings, robots=(tmp_path / "moved" / "robot.urdf",)))
+    with pytest.raises(SettingsError, match=r"samples-00000.* other robots or image settings"):
+        make_cache(tmp_path, replace(settings, robots=(tmp_path / "b" / "robot.urdf",)))
 
 
 def test_a_surface_network_learns_from_a_cache_and_goes_on_with_the_same_batches(tmp_path: Path):
