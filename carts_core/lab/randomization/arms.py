@@ -359,6 +359,7 @@ class RecordedPlacements:
         self._arms = {arm.name: arm for arm in sequence.scene.arms}
         self._cameras = sequence.scene.cameras
         self._joints = {name: np.asarray(sequence.measured[name], dtype=float)[indices] for name in self._arms}
+        self._mounts = [sequence.mounts(index) for index in indices]
         self._names: dict[Path, list[str]] = {}
         for name, arm in self._arms.items():
             self._names.setdefault(arm.robot.urdf, []).append(name)
@@ -386,7 +387,7 @@ class RecordedPlacements:
                 )
             free = [name for name in names if name not in taken] or names
             taken.append(free[int(rng.integers(len(free)))])
-            placements.append(self._placement(rng, taken[-1], geometry, camera.T_camera_world))
+            placements.append(self._placement(rng, taken[-1], geometry, camera))
         seen = _points(geometries[0], placements[0])
         seen = seen[seen[:, 2] > 1e-3]
         if not len(seen):
@@ -396,15 +397,15 @@ class RecordedPlacements:
         u, v = rng.uniform(0.1, 0.9, 2) * size
         return (fx, fy, u - fx * x / z, v - fy * y / z), placements
 
-    def _placement(
-        self, rng: np.random.Generator, name: str, geometry: RobotGeometry, T_camera_world: Float[np.ndarray, "4 4"]
-    ) -> Placement:
+    def _placement(self, rng: np.random.Generator, name: str, geometry: RobotGeometry, camera: Camera) -> Placement:
         rows = self._joints[name]
         least = np.where(np.array(geometry.robot.joint_types) == "revolute", _LEAST, 0.1 * _LEAST)
         spread = np.maximum(_JOINTS * np.ptp(rows, axis=0), least)
         low, high = geometry.robot.joint_limits.T
-        joints = np.clip(rows[int(rng.integers(len(rows)))] + rng.normal(0, 1, rows.shape[1]) * spread, low, high)
-        T_camera_base = T_camera_world @ self._arms[name].T_world_base
+        frame = int(rng.integers(len(rows)))
+        joints = np.clip(rows[frame] + rng.normal(0, 1, rows.shape[1]) * spread, low, high)
+        T_mount_world = self._mounts[frame].get(camera.name, np.eye(4))
+        T_camera_base = camera.T_camera_world @ T_mount_world @ self._arms[name].T_world_base
         placement = Placement(joints, T_camera_base)
         ahead = _points(geometry, placement)
         ahead = ahead[ahead[:, 2] > 0]

@@ -32,10 +32,11 @@ def image_digests(config: TrainingConfig) -> dict[str, Any]:
 
 
 def recording_digest(sequence: Sequence) -> str:
-    """Digest of a sequence file and of the measured joint positions."""
+    """Digest of a sequence file, the measured joint positions and the poses of camera mounts."""
+    mounts = [T for index in range(len(sequence)) for T in sequence.mounts(index).values()]
     # In single precision, rounding errors of different processors do not change the digest.
-    joints = (np.asarray(rows, np.float32).tobytes() for rows in sequence.measured.values())
-    return _digest(read_bytes(sequence.path, SEQUENCE), *joints)
+    values = (np.asarray(rows, np.float32).tobytes() for rows in (*sequence.measured.values(), *mounts))
+    return _digest(read_bytes(sequence.path, SEQUENCE), *values)
 
 
 def _digest(*contents: bytes) -> str:

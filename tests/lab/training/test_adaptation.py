@@ -81,6 +81,23 @@ def test_arms_are_placed_at_the_distance_of_the_recording_and_in_the_image(far_a
     assert inside == 40
 
 
+def test_arms_are_placed_in_front_of_a_moving_camera_as_in_front_of_a_fixed_one(far_away: Path):
+    def drawn() -> list[np.ndarray]:
+        geometry, rng = RobotGeometry(Robot.load(far_away.parent / "arm.urdf")), np.random.default_rng(0)
+        placements = RecordedPlacements(far_away)
+        return [placements(rng, (geometry,), (48, 32), 80)[1][0].T_camera_base for _ in range(8)]
+
+    fixed, text = drawn(), far_away.read_text()
+    T_camera_world = Sequence.open(far_away).scene.cameras[0].T_camera_world
+    T_world_mount = np.array([[0, 0, 1, 0.3], [1, 0, 0, -0.8], [0, 1, 0, 0.5], [0, 0, 0, 1]])
+    poses = [f"{frame},0.3,-0.8,0.5,0.5,0.5,0.5,0.5" for frame in range(4)]
+    (far_away.parent / "ecm.csv").write_text("\n".join(["frame,x,y,z,qx,qy,qz,qw", *poses]) + "\n")
+    given = next(line for line in text.splitlines() if line.startswith("T_camera_world"))
+    moving = f'T_camera_world = {(T_camera_world @ T_world_mount).tolist()}\nmotion = "ecm.csv"'
+    far_away.write_text(text.replace(given, moving))
+    np.testing.assert_allclose(drawn(), fixed, atol=1e-9)
+
+
 def test_a_robot_that_is_not_of_the_recording_is_refused(far_away: Path):
     with pytest.raises(SettingsError, match="not one of the recording's"):
         RecordedPlacements(far_away)(
