@@ -123,7 +123,7 @@ class OnnxSegmenter:
 
     def _features(self, image: np.ndarray, scale: float) -> dict[str, np.ndarray]:
         """Encoder features of an image, cached for further prompts on the same image."""
-        if self._last is None or self._last[0] is not image:
+        if self._last is None or not np.array_equal(self._last[0], image):
             height, width = image.shape[:2]
             size = round(width * scale), round(height * scale)
             resized = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
@@ -131,7 +131,7 @@ class OnnxSegmenter:
             square[: size[1], : size[0]] = (resized - _MEAN) / _DEVIATION
             (given,) = self._encoder.get_inputs()
             inputs = {given.name: _typed(square.transpose(2, 0, 1)[None], given.type)}
-            self._last = image, _run(self._encoder, inputs)
+            self._last = image.copy(), _run(self._encoder, inputs)
         return dict(self._last[1])
 
 

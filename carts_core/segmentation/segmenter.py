@@ -111,8 +111,8 @@ class NetworkSegmenter:
     def _likely(self, image: np.ndarray) -> np.ndarray:
         # The prediction is cached, since successive prompts usually refer to the same image, and the network is the
         # slowest part.
-        if self._last is None or self._last[0] is not image:
-            self._last = image, self._probability(image)
+        if self._last is None or not np.array_equal(self._last[0], image):
+            self._last = image.copy(), self._probability(image)
         return self._last[1]
 
 

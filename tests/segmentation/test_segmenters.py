@@ -18,7 +18,7 @@ from carts_core.errors import SettingsError, WeightsError
 from carts_core.evaluation.metrics import dice
 from carts_core.networks import FeatureExtractor
 from carts_core.recording import Sequence
-from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter
+from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter, onnx_segmenter
 from carts_core.segmentation.onnx_segmenter import OnnxSegmenter
 
 HEIGHT, WIDTH = 120, 160
@@ -79,10 +79,24 @@ def test_the_network_is_asked_once_for_an_image() -> None:
 
     segmenter, image = NetworkSegmenter(probability), _two_bars()
     for u in (30.5, 40.5, 50.5):
-        segmenter.segment(image, Prompt(inside=((u, 60.5),)))
+        segmenter.segment(image.copy(), Prompt(inside=((u, 60.5),)))
     assert len(asked) == 1
-    segmenter.segment(_two_bars(), Prompt(inside=((40.5, 60.5),)))
+    segmenter.segment(255 - image, Prompt(inside=((40.5, 60.5),)))
     assert len(asked) == 2
+
+
+def test_the_encoder_runs_again_for_a_changed_image_only(
+    model: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segmenter, image, runs = OnnxSegmenter.load(*model), _half_bright(), []
+    run = onnx_segmenter._run
+    monkeypatch.setattr(onnx_segmenter, "_run", lambda session, given: runs.append(given) or run(session, given))
+    prompt = Prompt(inside=((52.0, 24.0),))
+    assert segmenter.segment(image, prompt).any() and segmenter.segment(image.copy(), prompt).any()
+    assert len(runs) == 3
+    image[:] = 0
+    assert not segmenter.segment(image, prompt).any()
+    assert len(runs) == 5
 
 
 def test_a_click_on_each_instrument_of_the_shipped_recording_gives_its_mask(sample_sequence_path: Path) -> None:
