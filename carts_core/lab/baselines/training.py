@@ -146,25 +146,13 @@ CHUNK = 250
 
 
 class TrainingFrames:
-    """Training frames from the numbered files of `make_chunk`: images, surface maps of erroneous kinematics, and masks.
+    """Training frames: images, surface maps of erroneous kinematics, and masks.
 
-    Raises:
-        WeightsError: a file cannot be read, or contains other frames.
+    Args:
+        parts: tensors of each file of `make_chunk`.
     """
 
-    def __init__(self, folder: OutputPath, chunks: Iterable[int]) -> None:
-        parts = []
-        for path in (_file(folder, chunk).path for chunk in chunks):
-            try:
-                check_regular(path, WEIGHTS)
-                with safe_open(path, framework="pt") as file:
-                    if (file.metadata() or {}).get("settings") != _SETTINGS:
-                        raise ValueError("its frames were generated with other settings")
-                    parts.append([file.get_tensor(name) for name in ("images", "given", "masks")])
-            except (SafetensorError, OSError, ValueError) as error:
-                raise WeightsError(
-                    f"training frames {path} cannot be read ({error}). Delete the file to regenerate them."
-                ) from error
+    def __init__(self, parts: Iterable[list[Tensor]]) -> None:
         self._images, self._given, self._masks = (torch.cat(part) for part in zip(*parts, strict=True))
 
     def __len__(self) -> int:
@@ -176,6 +164,24 @@ class TrainingFrames:
         """Images, surface maps of the given kinematics, and masks of the frames with these numbers."""
         chosen = list(numbers)
         return (self._images[chosen], self._given[chosen].float() / SURFACE_UNIT, self._masks[chosen].float()[:, None])
+
+
+def _chunk(path: Path, seed: int) -> list[Tensor]:
+    """Images, surface maps and masks of a file of `make_chunk`."""
+    try:
+        check_regular(path, WEIGHTS)
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("settings") != _SETTINGS:
+                raise ValueError("its frames were generated with other settings")
+            if metadata.get("seed") != str(seed):
+                raise ValueError(f"its frames were generated with seed {metadata.get('seed')}, but the seed is {seed}")
+            return [file.get_tensor(name) for name in ("images", "given", "masks")]
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(
+            f"training frames {path} cannot be read ({error}). Delete the file to regenerate them, or give another "
+            "folder of frames."
+        ) from error
 
 
 def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
@@ -227,15 +233,17 @@ def prepare_frames(
 
     Raises:
         OutputError: the folder cannot be written to.
-        WeightsError: the folder contains other frames.
+        WeightsError: a file of frames cannot be read, or has other settings or another seed.
     """
     with locked_folder(folder.path):
         chunks = range(-(-training.frames // CHUNK))
+        parts = []
         for chunk in chunks:
             if not holds_file(_file(folder, chunk)):
                 say(f"training frames: part {chunk + 1} of {len(chunks)}")
                 make_chunk(folder, chunk, training.seed)
-    return TrainingFrames(folder, chunks)
+            parts.append(_chunk(_file(folder, chunk).path, training.seed))
+    return TrainingFrames(parts)
 
 
 def train_baseline(

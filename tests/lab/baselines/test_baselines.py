@@ -1,5 +1,6 @@
 """Networks of others: built, trained for a step, written, read, and put into the benchmark."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,8 @@ def test_frames_are_made_once_and_are_the_same_each_time(tmp_path: Path, monkeyp
     images, given, masks = frames.batch([0, 1])
     assert images.shape == (2, 3, 192, 256) and given.shape == (2, 6, 192, 256) and masks.shape == (2, 1, 192, 256)
     assert 0 < masks.mean() < 0.6 and float(given.abs().max()) <= 1.01
+    with pytest.raises(WeightsError, match=r"frames_000.* with seed 5, but the seed is 6\). Delete .* another folder"):
+        prepare_frames(folder, replace(settings, seed=6, frames=101), said.append)
     first.write_bytes(first.read_bytes()[:1000])
     with pytest.raises(WeightsError, match=r"frames_000.safetensors cannot be read .* Delete the file"):
         prepare_frames(folder, settings, said.append)
