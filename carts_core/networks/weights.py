@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..errors import SettingsError, WeightsError
 from ..files import write_bytes
@@ -130,20 +130,12 @@ def _filled(
     shapes: Mapping[str, tuple[int, ...]],
 ) -> ImageNetwork:
     """Create the network with the tensors of the file."""
-    # The network is created without memory, so that nothing is allocated for an architecture that does not fit the
-    # file.
-    with torch.device("meta"):
-        wanted = {name: tuple(value.shape) for name, value in make_network(architecture).state_dict().items()}
-    if wanted != shapes:
-        differing = [name for name in sorted(wanted.keys() | shapes.keys()) if wanted.get(name) != shapes.get(name)]
-        first = differing[0]
-        raise WeightsError(
-            f"weights file {path} does not fit its architecture {architecture}: {shortened(first)} is "
-            f"{shapes.get(first, 'missing')}, but should be {wanted.get(first, 'absent')}. {REMEDY}"
-        )
+    differing = misfit(lambda: make_network(architecture), shapes)
+    if differing is not None:
+        raise WeightsError(f"weights file {path} does not fit its architecture {architecture}: {differing}. {REMEDY}")
     try:
         with safe_open(path, framework="pt") as file:
-            state = {name: file.get_tensor(name) for name in wanted}
+            state = {name: file.get_tensor(name) for name in shapes}
         network = make_network(architecture)
         network.load_state_dict(state)
     except (SafetensorError, OSError, RuntimeError, ValueError) as error:
@@ -153,3 +145,17 @@ def _filled(
     if not all(bool(value.isfinite().all()) for value in state.values()):
         raise WeightsError(f"weights file {path} holds values that are not finite. {REMEDY}")
     return network
+
+
+def misfit(make_network: Callable[[], nn.Module], shapes: Mapping[str, tuple[int, ...]]) -> str | None:
+    """First tensor of a file that does not fit a network, as a clause; None if names and shapes of all tensors fit.
+
+    The network is created without memory, so that nothing is allocated for an architecture that does not fit the file.
+    """
+    with torch.device("meta"):
+        wanted = {name: tuple(value.shape) for name, value in make_network().state_dict().items()}
+    differing = [name for name in sorted(wanted.keys() | shapes.keys()) if wanted.get(name) != shapes.get(name)]
+    if not differing:
+        return None
+    first = differing[0]
+    return f"{shortened(first)} is {shapes.get(first, 'missing')}, but should be {wanted.get(first, 'absent')}"

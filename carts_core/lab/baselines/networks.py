@@ -21,7 +21,7 @@ from ...files import OutputPath, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json, read_bytes
 from ...model.parts import SURFACE_CHANNELS
 from ...networks.network import FeatureNetwork
-from ...networks.weights import read_weights, tensor_bytes
+from ...networks.weights import misfit, read_weights, tensor_bytes
 from ...package_imports import require_package
 from ...settings import Architecture
 from ...settings.training import BaselineNetwork
@@ -219,7 +219,12 @@ def read_baseline(path: Path) -> TrainedBaseline:
             unet = Architecture.from_json(values.pop("unet"))
             width, height = values.pop("size")
             decoder = tuple(int(n) for n in values.pop("decoder"))
-            network = Baseline(BaselineNetwork(**values, decoder=decoder, size=(int(width), int(height)), unet=unet))
+            settings = BaselineNetwork(**values, decoder=decoder, size=(int(width), int(height)), unet=unet)
+            shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
+            differing = misfit(lambda: Baseline(settings), shapes)
+            if differing is not None:
+                raise ValueError(differing)
+            network = Baseline(settings)
             tensors = {name: file.get_tensor(name) for name in file.keys()}
             if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
                 raise ValueError("it has values that are not finite")

@@ -12,6 +12,7 @@ from carts_core.errors import SettingsError, WeightsError
 from carts_core.files import output_path
 from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline
 from carts_core.lab.baselines.training import TrainingFrames, make_chunk, prepare_frames, train_baseline
+from carts_core.networks.network import FeatureNetwork
 from carts_core.settings import Architecture
 from carts_core.settings.training import BaselineName, BaselineNetwork, BaselineTraining
 
@@ -115,6 +116,22 @@ def test_weights_of_something_else_are_refused_in_words(tmp_path: Path) -> None:
     save_baseline(network, output_path(tmp_path, "n.safetensors"), {"augmentation": "smoke"})
     with pytest.raises(WeightsError, match="not finite"):
         read_baseline(tmp_path / "n.safetensors")
+
+
+def test_a_network_that_does_not_fit_its_file_is_not_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = Baseline(_smallest("unet"))
+    network.body = torch.nn.Linear(1, 1, bias=False)
+    save_baseline(network, output_path(tmp_path, "w.safetensors"), {"augmentation": "smoke"})
+    devices: list[torch.device] = []
+
+    def create(architecture: Architecture) -> FeatureNetwork:
+        devices.append(torch.get_default_device())
+        return FeatureNetwork(architecture)
+
+    monkeypatch.setattr("carts_core.lab.baselines.networks.FeatureNetwork", create)
+    with pytest.raises(WeightsError, match=r"is not a baseline \(body\.\S+ is missing, but should be \("):
+        read_baseline(tmp_path / "w.safetensors")
+    assert devices == [torch.device("meta")]
 
 
 @pytest.mark.parametrize(
