@@ -19,6 +19,7 @@ from ..errors import SettingsError, WeightsError
 from ..files import write_bytes
 from ..files.reading import WEIGHTS, parse_json, read_bytes
 from ..settings import Architecture, SurfaceArchitecture
+from ..settings.training import MAX_SIDE
 from ..wording import shortened
 from .header import REMEDY, read_header, unreadable
 from .network import FeatureNetwork, ImageNetwork
@@ -50,7 +51,6 @@ _NETWORKS: dict[tuple[str, str], tuple[type[Architecture | SurfaceArchitecture],
 }
 """Format and version -> architecture and network."""
 _TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
-_MAX_SIDE = 4096
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,10 @@ def read_weights(path: Path) -> Weights:
     kind, make_network = _NETWORKS[metadata["format"], metadata["version"]]
     architecture, working_size, training = _described(path, metadata, kind)
     network = _filled(path, make_network, architecture, shapes)
-    if len(working_size) != 2 or any(not 0 < n <= _MAX_SIDE or n % architecture.stride for n in working_size):
+    if len(working_size) != 2 or any(not 0 < n <= MAX_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
             f"weights file {path} has the working size {working_size}; allowed: two positive multiples of "
-            f"{architecture.stride} up to {_MAX_SIDE}. {REMEDY}"
+            f"{architecture.stride} up to {MAX_SIDE}. {REMEDY}"
         )
     return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
 

@@ -192,15 +192,21 @@ class AppearanceRanges(Ranged):
             raise SettingsError("gamma must be positive and jpeg_quality at most 100; correct the range.")
 
 
+MAX_SIDE = 4096
+"""Maximum width and height of images for which a network is trained [px]."""
+Side = Annotated[int, Range(16, MAX_SIDE, unit="px")]
+"""Width or height of an image."""
+
+
 @dataclass(frozen=True)
 class ImageSettings(Ranged):
     """Settings of training images."""
 
-    width: int = 192
+    width: Side = 192
     """Width of a training image [px]."""
-    height: int = 160
+    height: Side = 160
     """Height of a training image [px]."""
-    field_width: int = 320
+    field_width: Side = 320
     """Width of the camera image from which a training image is cropped [px]; focal lengths refer to it."""
     two_arms: Share = 0.4
     """Share of pairs with two arms."""
@@ -235,7 +241,7 @@ class ImageSettings(Ranged):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
+        if self.width % 16 or self.height % 16:
             raise SettingsError(
                 f"training images have {self.width}x{self.height} px; both lengths must be positive multiples of 16."
             )

@@ -74,6 +74,7 @@ def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Rob
         (ImageSettings, {"absent": 2}, "absent is 2; allowed: 0 to 1"),
         (ImageSettings, {"coverage": (0.5, 0.1)}, "give two fractions"),
         (ImageSettings, {"field_width": 64}, "give at least the width"),
+        (ImageSettings, {"field_width": 5000}, "field_width is 5000; allowed: 16 to 4096 px"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings: type, arguments: dict, allowed: str):
