@@ -361,7 +361,7 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
     for text in given:
         remedy = "Give a file in the format of --print-settings, or `NAME=VALUE`."
         try:
-            single = "=" in text and not Path(text).exists()
+            single = "=" in text and not os.path.exists(text)
             content = parse_toml(_of_solver(text) if single else read_text(Path(text), SETTINGS))
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(f"--settings {text} cannot be read: {error}. {remedy}") from error

@@ -47,6 +47,14 @@ def test_single_settings_need_no_file() -> None:
         SolverOptions(settings=("iterations=0",))
 
 
+def test_a_single_setting_may_be_longer_than_a_file_name(tmp_path: Path) -> None:
+    text = "stages = [" + 10 * "{ stage = 'Descend', blur = 2.0 }, " + "]"
+    assert len(text) > 300
+    path = tmp_path / "settings.toml"
+    path.write_text(f"[solver]\n{text}\n", encoding="utf-8")
+    assert SolverOptions(settings=(text,)).chosen == SolverOptions(settings=(str(path),)).chosen != SurfaceSolver()
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
