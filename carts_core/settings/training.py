@@ -241,6 +241,11 @@ class ImageSettings(Ranged):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.chains and self.recording is not None:
+            raise SettingsError(
+                f"chains is {self.chains}, but random robots have no poses in the recording {self.recording}. "
+                "Leave out `chains`."
+            )
         if self.width % 16 or self.height % 16:
             raise SettingsError(
                 f"training images have {self.width}x{self.height} px; both lengths must be positive multiples of 16."

@@ -291,7 +291,7 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
 
     Raises:
         SequenceError: the recording cannot be read.
-        SettingsError: `output` holds a run with another recording.
+        SettingsError: `output` holds a run with another recording, or `given` includes random robots.
         WeightsError: the checkpoint in `output` cannot be read.
         OutputError: `output` cannot be written to.
         BusyError: another run writes to `output`.

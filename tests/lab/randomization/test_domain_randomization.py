@@ -74,6 +74,11 @@ def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Rob
         (ImageSettings, {"absent": 2}, "absent is 2; allowed: 0 to 1"),
         (ImageSettings, {"coverage": (0.5, 0.1)}, "give two fractions"),
         (ImageSettings, {"field_width": 64}, "give at least the width"),
+        (
+            ImageSettings,
+            {"chains": 0.1, "recording": Path("a.toml")},
+            "no poses in the recording a.toml. Leave out `chains`",
+        ),
         (ImageSettings, {"field_width": 5000}, "field_width is 5000; allowed: 16 to 4096 px"),
     ],
 )
