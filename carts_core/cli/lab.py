@@ -125,6 +125,13 @@ class Train(RangedOptions):
 
 
 @dataclass(frozen=True)
+class BaselineOptions(BaselineNetwork):
+    """Architecture of a baseline; its input has the size of the training frames."""
+
+    size: tyro.conf.Suppress[tuple[int, int]] = BaselineNetwork.size
+
+
+@dataclass(frozen=True)
 class Baseline:
     """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; rerun the command to resume."""
 
@@ -132,7 +139,7 @@ class Baseline:
     """Folder for checkpoints and weights."""
     frames: Path = Path("runs/baseline_frames")
     """Folder of training frames, shared by all baselines; missing frames are created."""
-    network: Annotated[BaselineNetwork, tyro.conf.arg(name="")] = field(default_factory=BaselineNetwork)
+    network: Annotated[BaselineOptions, tyro.conf.arg(name="")] = field(default_factory=BaselineOptions)
     training: BaselineTraining = field(default_factory=BaselineTraining)
     """Settings of the training."""
 
