@@ -81,6 +81,10 @@ def command_class(name: str, options: Sequence[str] = ()) -> Any:
 
         if options[0] in get_args(DataSet):
             return BenchDataSet
+    if name == "train" and any(option.split("=")[0] == "--for" for option in options):
+        from .lab import Adapt
+
+        return Adapt
     module, kind = COMMANDS[name]
     return getattr(import_module(f".{module}", __package__), kind)
 

@@ -12,7 +12,7 @@ from ..errors import CartsError
 from ..files import output_path
 from ..settings import SynthesisConfig, TrainingConfig
 from ..settings.ranges import Count
-from ..settings.training import BaselineNetwork, BaselineTraining
+from ..settings.training import ADAPTATION_SETTINGS, BaselineNetwork, BaselineTraining
 from ..stopping import message_if_stopped
 from ..wording import counted
 from .options import Network, RangedOptions, check_device, output_folder
@@ -55,7 +55,7 @@ class Train(RangedOptions):
     for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
     """Sequence file whose robots, cameras, distances and empty backgrounds the network is adapted to. Training stops
     when validation no longer improves, or after `--steps` or `--minutes` of CPU time; if neither is given, after 400
-    steps. The weights are accepted if no metric of the fits gets worse.
+    steps. The weights are accepted if no metric of the fits gets worse. `--for SEQUENCE --help` shows the defaults.
     """
     fits: Count = 8
     """With `--for`: number of synthetic images for the comparison of fits; half as many frames of the recording are
@@ -122,6 +122,13 @@ class Train(RangedOptions):
             return
         console.print(f"weights: {found.weights}")
         console.print(f"To use them: carts optimize {recording} --weights {found.weights}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Adapt(Train):
+    """`carts train --for`: the network is adapted to a recording, with other defaults."""
+
+    training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: ADAPTATION_SETTINGS)
 
 
 @dataclass(frozen=True)

@@ -352,6 +352,20 @@ class TrainingConfig(Ranged):
             )
 
 
+ADAPTATION_SETTINGS = TrainingConfig(
+    network="surface",
+    steps=10**6,
+    learning_rate=6e-4,
+    warmup=15,
+    average=0.97,
+    validation_every=40,
+    validation_samples=48,
+    patience=5,
+    images=ImageSettings(from_photographs=0.5),
+)
+"""Default settings of an adaptation to a recording. `steps` is no limit; without `minutes`, the limit is lower."""
+
+
 BaselineName = Literal["unet", "hrnet", "swin", "colleoni"]
 """Baseline network. Three baselines use only the image; Colleoni's network also uses a rendering of the kinematics."""
 Augmentation = Literal["none", "smoke", "autoaugment", "elastic", "projective"]

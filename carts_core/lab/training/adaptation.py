@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from ...errors import SettingsError
 from ...files import locked_folder, output_path, remove_file, write_bytes, write_text
 from ...files.reading import WEIGHTS, read_bytes
 from ...model.camera import Camera
@@ -25,6 +26,7 @@ from ...recording import Frame, Sequence, evenly_spaced
 from ...rendering import Renderer
 from ...resources import shipped_weights
 from ...settings import TrainingConfig
+from ...settings.training import ADAPTATION_SETTINGS
 from ..randomization.samples import Observer, to_uint8
 from .digests import recording_digest
 from .loop import checked_checkpoint
@@ -249,18 +251,8 @@ def _tips_in_view(scene: Scene, state: SceneState) -> Float[np.ndarray, "tips 2"
 
 STEPS = 400
 """Default number of steps if neither steps nor a time limit is given."""
-_VALIDATION_EVERY = 40
 BACKGROUNDS = "backgrounds"
 """Name of the run's folder with backgrounds of the recording, without arms."""
-_FROM_RECORDING = 0.5
-"""Share of training backgrounds that are crops of backgrounds of the recording."""
-_LEARNING_RATE = 6e-4
-_WARMUP = 15
-_AVERAGE = 0.97
-_SAMPLES = 48
-_PATIENCE = 5
-
-
 FITS = "fits.json"
 """File name of the report that compares fits with the initial and the adapted weights."""
 REFUSED = "refused.safetensors"
@@ -280,47 +272,46 @@ class Offer:
 
 
 def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> TrainingConfig:
-    """Settings that adapt the surface network to a recording, whose backgrounds are written to `output`.
-
-    Robots, initial weights, steps and time are those of `given`, except for values equal to the defaults.
+    """Settings that adapt the surface network to a recording, whose backgrounds are written to `output` unless
+    photographs are given.
 
     Args:
         recording: sequence file; its images are only used for the background without arms.
         output: folder of the run, created after the recording was read.
-        given: all other settings.
+        given: other settings, usually changes of `ADAPTATION_SETTINGS`. The default robots are replaced by those of the
+            recording, and the default steps by `STEPS` if there is no time limit.
 
     Raises:
+        SettingsError: another network is to be trained, `given` names a recording or includes random robots, or `output`
+            holds a run with another recording.
         SequenceError: the recording cannot be read.
-        SettingsError: `output` holds a run with another recording, or `given` includes random robots.
         WeightsError: the checkpoint in `output` cannot be read.
         OutputError: `output` cannot be written to.
         BusyError: another run writes to `output`.
     """
-    sequence = Sequence.open(recording)
+    if given.network != "surface" or given.images.recording is not None:
+        raise SettingsError(
+            f"network is {given.network!r} and images.recording is {given.images.recording}, but an adaptation trains "
+            "the surface network with its own recording. Leave out these settings."
+        )
+    sequence, photographs = Sequence.open(recording), given.images.photographs
     with locked_folder(output):
         checked_checkpoint(output, {"recording_digest": recording_digest(sequence)})
-        found = _write_backgrounds(sequence, output)
-    default, samples, every = TrainingConfig(), given.validation_samples, given.validation_every
+        if photographs is None and _write_backgrounds(sequence, output):
+            photographs = output / BACKGROUNDS
+    default = ADAPTATION_SETTINGS
     robots = tuple(dict.fromkeys(arm.robot.urdf for arm in sequence.scene.arms))
     images = replace(
         given.images,
         recording=recording.absolute(),
-        photographs=output / BACKGROUNDS if found else given.images.photographs,
-        from_photographs=_FROM_RECORDING if found else given.images.from_photographs,
+        photographs=photographs,
         two_arms=given.images.two_arms if len(sequence.scene.arms) > 1 else 0.0,
     )
     return replace(
         given,
-        network="surface",
         robots=robots if given.robots == default.robots else given.robots,
         start=given.start or shipped_weights()[1],
-        steps=given.steps if given.steps != default.steps else STEPS if given.minutes is None else 10**6,
-        learning_rate=_LEARNING_RATE if given.learning_rate == default.learning_rate else given.learning_rate,
-        warmup=_WARMUP,
-        average=_AVERAGE,
-        validation_samples=_SAMPLES if samples == default.validation_samples else samples,
-        validation_every=every if every != default.validation_every else _VALIDATION_EVERY,
-        patience=_PATIENCE,
+        steps=STEPS if given.minutes is None and given.steps == default.steps else given.steps,
         images=images,
     )
 

@@ -127,6 +127,7 @@ def _predictions(examples: Panels) -> Figure:
 
 
 _LOG_EVERY = 10
+_ENCODER_DEFAULTS = TrainingConfig.frozen, TrainingConfig.encoder_rate
 _EXAMPLES = 6
 _MAY_CHANGE = (
     "steps",
@@ -175,6 +176,11 @@ class _Run:
         self.network = channels_last(_first_network(config).to(config.device))
         if isinstance(self.network, SurfaceNetwork):
             self.network.encoder.freeze(config.frozen)
+        elif (config.frozen, config.encoder_rate) != _ENCODER_DEFAULTS:
+            raise SettingsError(
+                f"frozen is {config.frozen} and encoder_rate {config.encoder_rate}, but "
+                f"{config.start or 'the feature network'} has no pretrained encoder. Leave out these settings."
+            )
         config = _with_architecture(config, self.network)
         self.config, self.output, self.task = config, output, task_of(config.network)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)

@@ -21,6 +21,7 @@ from carts_core.networks.weights import read_weights
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence, shipped_weights
 from carts_core.settings import ImageSettings, TrainingConfig
+from carts_core.settings.training import ADAPTATION_SETTINGS
 
 ARM = """<robot name="arm"><link name="base"/>
 <link name="upper"><visual><origin xyz="0 0 0.3"/><geometry><box size="0.1 0.1 0.6"/></geometry></visual></link>
@@ -106,7 +107,7 @@ def test_a_robot_that_is_not_of_the_recording_is_refused(far_away: Path):
 
 
 def test_settings_come_from_the_recording_and_the_shipped_weights_unless_they_are_given(tmp_path: Path):
-    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
+    config = adapted_to(sample_sequence(), tmp_path, ADAPTATION_SETTINGS)
     assert config.start == shipped_weights()[1]
     assert (config.steps, config.minutes) == (STEPS, None)
     assert [path.name for path in config.robots] == ["psm_lnd.urdf"]
@@ -114,9 +115,33 @@ def test_settings_come_from_the_recording_and_the_shipped_weights_unless_they_ar
     assert config.images.photographs == tmp_path / BACKGROUNDS
     cameras = len(Sequence.open(sample_sequence()).scene.cameras)
     assert len(list((tmp_path / BACKGROUNDS).glob("*.png"))) == cameras
-    given = TrainingConfig(minutes=3.0, learning_rate=1e-4, start=Path("other.safetensors"))
+    given = replace(ADAPTATION_SETTINGS, minutes=3.0, learning_rate=1e-4, start=Path("other.safetensors"))
     config = adapted_to(sample_sequence(), tmp_path, given)
     assert (config.minutes, config.learning_rate, config.start) == (3.0, 1e-4, Path("other.safetensors"))
+
+
+def test_given_options_are_kept_and_those_that_cannot_apply_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    taken: list[TrainingConfig] = []
+
+    def train(config: TrainingConfig, *_: object):
+        taken.append(config)
+        raise SettingsError("enough")
+
+    def run(options: str) -> str:
+        with pytest.raises(SystemExit):
+            main(["train", str(tmp_path / "run"), f"--for={sample_sequence()}", *options.split()])
+        return " ".join(capsys.readouterr().err.split())
+
+    with monkeypatch.context() as patch:
+        patch.setattr("carts_core.lab.training.training.train", train)
+        run("--patience 20 --steps 4000 --warmup 100 --validation-every 250 --images.photographs mine")
+    (config,) = taken
+    assert (config.patience, config.steps, config.warmup, config.validation_every) == (20, 4000, 100, 250)
+    assert (config.images.photographs, config.images.from_photographs) == (Path("mine"), 0.5)
+    assert (config.learning_rate, config.average, config.validation_samples) == (6e-4, 0.97, 48)
+    assert "network is 'feature'" in run("--network feature")
 
 
 def test_a_missing_recording_is_named_and_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -129,7 +154,9 @@ def test_a_missing_recording_is_named_and_leaves_no_folder(tmp_path: Path, capsy
 @pytest.fixture
 def config(tiny_sequence: Callable[..., Path], tmp_path: Path) -> TrainingConfig:
     """A run of one step that is adapted to a tiny recording."""
-    given = TrainingConfig(workers=0, threads=1, batch_size=1, validation_samples=1, steps=1, images=SMALL)
+    given = replace(
+        ADAPTATION_SETTINGS, workers=0, threads=1, batch_size=1, validation_samples=1, steps=1, images=SMALL
+    )
     return adapted_to(tiny_sequence(), tmp_path / "adapted", given)
 
 
@@ -250,7 +277,7 @@ def test_weights_are_offered_only_where_nothing_is_worse(
 
 @pytest.mark.slow
 def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):
-    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
+    config = adapted_to(sample_sequence(), tmp_path, ADAPTATION_SETTINGS)
     (first,), (again,) = (list(synthetic_images(config, 1)) for _ in range(2))
     assert first.frame.images["made"].shape == (240, 320, 3)
     assert np.array_equal(first.frame.images["made"], again.frame.images["made"])

@@ -167,6 +167,11 @@ def test_weights_of_another_network_are_refused(tmp_path: Path, small_weights: P
         train(small_config(network="surface", start=small_weights), tmp_path)
 
 
+def test_settings_of_an_encoder_are_refused_without_one(tmp_path: Path):
+    with pytest.raises(SettingsError, match=r"frozen is 2 and encoder_rate 0\.3, but the feature network has no"):
+        train(small_config(frozen=2), tmp_path)
+
+
 def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"half a file")
     with pytest.raises(WeightsError, match=r"checkpoint\.safetensors is not a readable checkpoint.*Delete the file"):
