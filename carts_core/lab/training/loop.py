@@ -172,7 +172,8 @@ class TrainingLoop:
         self.history = History()
         self._resume(may_change)
         self._saved = self.step
-        self._clock, self._worked = time.perf_counter(), time.process_time()
+        self._clock = time.perf_counter()
+        self._worked: float | None = None
 
     def _resume(self, may_change: tuple[str, ...]) -> None:
         checkpoint = checked_checkpoint(self._output, json.loads(self._config_json), may_change)
@@ -219,7 +220,7 @@ class TrainingLoop:
                 logged(means, self._take_time() / count)
                 sums, count = {}, 0
             if last or self.step % self._settings.checkpoint_every == 0:
-                self._checkpoint()
+                self.checkpoint()
 
     def _train_step(
         self, batch: Batch, loss_of: Callable[[Batch], tuple[Tensor, dict[str, Tensor]]]
@@ -249,11 +250,11 @@ class TrainingLoop:
         """Write a checkpoint unless the last checkpoint is current; used when a run is stopped between two steps."""
         if self.step > self._saved:
             self._take_time()
-            self._checkpoint()
+            self.checkpoint()
 
     def _processor_seconds(self) -> float:
-        """CPU time per thread that is not yet in the history [s]."""
-        return (time.process_time() - self._worked) / self._settings.threads
+        """CPU time per thread that is not yet in the history [s]; 0 before `run`."""
+        return 0.0 if self._worked is None else (time.process_time() - self._worked) / self._settings.threads
 
     def _take_time(self) -> float:
         """Add the time since the last call to the history; returns the wall time [s]."""
@@ -263,7 +264,8 @@ class TrainingLoop:
         self._clock, self._worked = time.perf_counter(), time.process_time()
         return elapsed
 
-    def _checkpoint(self) -> None:
+    def checkpoint(self) -> None:
+        """Write a checkpoint."""
         save_checkpoint(self._output, self._modules, self._optimizer, self.step, self._config_json, self.history)
         self._saved = self.step
 

@@ -21,7 +21,7 @@ from ...networks.network import ImageNetwork, channels_last
 from ...networks.surface import SurfaceNetwork
 from ...networks.weights import read_weights, save_weights
 from ...settings import TrainingConfig
-from ...stopping import message_if_stopped
+from ...stopping import finished_first, message_if_stopped
 from ...wording import counted
 from .cache import make_cache
 from .digests import run_digests
@@ -198,6 +198,9 @@ class _Run:
             # The initial validation is the baseline for `patience`.
             validation = self._validate(samples)
             progress(TrainingProgress(loop.step, loop.planned, math.nan, math.nan, validation, validation))
+        elif self._lacks_validation():
+            validation = self._validate(samples)
+            loop.checkpoint()
         if loop.step < loop.planned and not self._has_ended_gaining():
             validation = self._train(samples, validation, progress)
         if self.config.patience is not None:
@@ -243,6 +246,12 @@ class _Run:
             )
         return validation
 
+    def _lacks_validation(self) -> bool:
+        """Whether the run was stopped between a step and its validation."""
+        loop, known = self.loop, self.history.validations
+        due = loop.step >= loop.planned or (loop.step > 0 and loop.step % self.config.validation_every == 0)
+        return due and not (known and known[-1]["step"] == loop.step)
+
     def kept(self) -> str:
         """Message on the files of a stopped run."""
         if self.loop.step == 0:
@@ -262,9 +271,10 @@ class _Run:
     def _validate(self, samples: Batch) -> dict[str, float]:
         validation = self.task.validate(self._averaged().folded(), samples)
         best = max(map(self._score, self.history.validations), default=-math.inf)
-        self.history.validations.append({"step": self.loop.step, **validation})
-        if self.config.patience is None or self._score(validation) > best:
-            self._save(validation)
+        with finished_first():
+            self.history.validations.append({"step": self.loop.step, **validation})
+            if self.config.patience is None or self._score(validation) > best:
+                self._save(validation)
         return validation
 
     def _has_ended_gaining(self) -> bool:

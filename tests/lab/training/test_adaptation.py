@@ -1,5 +1,6 @@
 """`carts train --for`: a network is adapted to the robots, cameras and distances of a recording."""
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import SettingsError
 from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
 from carts_core.lab.training.adaptation import BACKGROUNDS, STEPS, Fits, Judgement, adapted_to, synthetic_images
+from carts_core.lab.training.loader import validation_set
 from carts_core.lab.training.loop import load_checkpoint
 from carts_core.lab.training.tasks import SurfaceTask, dice, pooled_dice, tip_error
 from carts_core.lab.training.training import train
@@ -208,6 +210,39 @@ def test_weights_with_better_masks_and_worse_tips_or_parts_are_not_kept(
     result = train(config, tmp_path)
     assert result.validation["step"] == kept
     assert read_weights(result.weights).training["step"] == kept
+
+
+def test_a_validation_lost_to_a_stop_is_made_up_for(
+    config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def stopped() -> dict[str, float]:
+        raise KeyboardInterrupt
+
+    figures = iter([lambda: FIGURES, stopped, lambda: {**FIGURES, "dice": 0.9}])
+    monkeypatch.setattr(SurfaceTask, "validate", lambda *_: next(figures)())
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path)
+    assert read_weights(tmp_path / "surface.safetensors").training["step"] == 0
+    result = train(config, tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None and [entry["step"] for entry in checkpoint.history.validations] == [0, 1]
+    assert read_weights(result.weights).training["step"] == result.validation["step"] == 1
+
+
+def test_making_validation_images_is_no_training_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    config = TrainingConfig(workers=0, threads=1, batch_size=1, validation_samples=1, steps=2, minutes=10, images=SMALL)
+    train(config, tmp_path)
+    burnt, clock = [0.0], time.process_time
+
+    def slow_validation_set(config: TrainingConfig):
+        burnt[0] += 1000.0
+        return validation_set(config)
+
+    monkeypatch.setattr("carts_core.lab.training.loop.time.process_time", lambda: clock() + burnt[0])
+    monkeypatch.setattr("carts_core.lab.training.training.validation_set", slow_validation_set)
+    train(replace(config, steps=4), tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None and checkpoint.step == 4
 
 
 def test_minutes_are_processor_time(config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
