@@ -32,12 +32,14 @@ from ..training.tasks import dice
 from .networks import Baseline, save_baseline, segmentation_models, start_from
 
 Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Augmentation of an image [3, h, w], uint8, and its mask [1, h, w]."""
+"""Augmentation of an image [3, h, w], uint8, and its maps [7, h, w]: the mask and the given surface map."""
 
 SMOKE_SHARE, SMOKE_STRENGTH = 0.2, 0.3
 """Share of images with smoke, and maximum opacity of the smoke: `p` and `smoke_aug` in the released configuration of
 the paper."""
 _SMOKE_WHITE = 255.0
+_NORMALS = slice(1 + NORMALS.start, 1 + NORMALS.stop)
+"""Channels of normals in the maps of `Change`. Their directions are those before a shear or warp."""
 _GEOMETRIC = {"ShearX", "ShearY", "TranslateX", "TranslateY", "Rotate"}
 
 
@@ -45,9 +47,9 @@ def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
     """Create an augmentation by name; augmentations of torchvision use torch's global random numbers."""
     match name:
         case "none":
-            return lambda image, mask: (image, mask)
+            return lambda image, maps: (image, maps)
         case "smoke":
-            return lambda image, mask: (smoked(image, rng), mask)
+            return lambda image, maps: (smoked(image, rng), maps)
         case "autoaugment":
             return _AutoAugment()
         case "elastic" | "projective":
@@ -94,7 +96,7 @@ def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) 
 
 
 class _AutoAugment:
-    """AutoAugment of torchvision with the policy for ImageNet; geometric transforms are applied to image and mask."""
+    """AutoAugment of torchvision with the policy for ImageNet; geometric transforms are applied to image and maps."""
 
     def __init__(self) -> None:
         segmentation_models()
@@ -102,7 +104,7 @@ class _AutoAugment:
 
         self._module, self._policy = autoaugment, autoaugment.AutoAugment()
 
-    def __call__(self, image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, image: Tensor, maps: Tensor) -> tuple[Tensor, Tensor]:
         policy = self._policy
         chosen, chances, signs = policy.get_params(len(policy.policies))
         space = policy._augmentation_space(10, (image.shape[1], image.shape[2]))
@@ -115,8 +117,13 @@ class _AutoAugment:
                 magnitude = -magnitude
             image = self._applied(image, name, magnitude)
             if name in _GEOMETRIC:
-                mask = self._applied(mask, name, magnitude)
-        return image, mask
+                maps = self._applied(maps, name, magnitude)
+            if name == "Rotate":
+                x, y, _ = maps[_NORMALS].clone()
+                cos, sin = np.cos(np.deg2rad(magnitude)), np.sin(np.deg2rad(magnitude))
+                # torchvision's angle is counterclockwise; y points down.
+                maps[_NORMALS.start], maps[_NORMALS.start + 1] = cos * x + sin * y, cos * y - sin * x
+        return image, maps
 
     def _applied(self, picture: Tensor, name: str, magnitude: float) -> Tensor:
         return self._module._apply_op(picture, name, magnitude, self._policy.interpolation, None)
@@ -129,9 +136,9 @@ def _warped(name: Augmentation) -> Change:
 
     transform = v2.ElasticTransform() if name == "elastic" else v2.RandomPerspective()
 
-    def change(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        image, mask = transform(tv_tensors.Image(image), tv_tensors.Mask(mask))
-        return image.as_subclass(Tensor), mask.as_subclass(Tensor)
+    def change(image: Tensor, maps: Tensor) -> tuple[Tensor, Tensor]:
+        image, maps = transform(tv_tensors.Image(image), tv_tensors.Mask(maps))
+        return image.as_subclass(Tensor), maps.as_subclass(Tensor)
 
     return change
 
@@ -333,8 +340,9 @@ class _Run:
         numbers = rng.integers(len(self.frames) - VALIDATION, size=self.training.batch_size)
         images, given, masks = self.frames.batch(map(int, numbers))
         change = augmentation(self.training.augmentation, rng)
-        changed = [change(image, mask) for image, mask in zip(images, masks, strict=True)]
-        images, masks = (torch.stack(part) for part in zip(*changed, strict=True))
+        changed = [change(image, map_) for image, map_ in zip(images, torch.cat([masks, given], 1), strict=True)]
+        images, maps = (torch.stack(part) for part in zip(*changed, strict=True))
+        masks, given = maps[:, :1], maps[:, 1:]
         for dimension, normal in ((-1, NORMALS.start), (-2, NORMALS.start + 1)):
             if rng.integers(2):
                 images, given, masks = (part.flip(dimension) for part in (images, given, masks))

@@ -11,10 +11,18 @@ from safetensors.torch import save_file
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.files import output_path
 from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline
-from carts_core.lab.baselines.training import TrainingFrames, make_chunk, prepare_frames, train_baseline
+from carts_core.lab.baselines.training import (
+    TrainingFrames,
+    _AutoAugment,
+    _Run,
+    augmentation,
+    make_chunk,
+    prepare_frames,
+    train_baseline,
+)
 from carts_core.networks.network import FeatureNetwork
 from carts_core.settings import Architecture
-from carts_core.settings.training import BaselineName, BaselineNetwork, BaselineTraining
+from carts_core.settings.training import Augmentation, BaselineName, BaselineNetwork, BaselineTraining
 
 SMALLEST = {
     "unet": {"unet": Architecture(widths=(4, 6, 8, 8, 8), local_mean=False)},
@@ -78,6 +86,26 @@ def test_a_u_net_finds_the_square_after_some_steps_and_a_stopped_run_goes_on(tmp
     with pytest.raises(SettingsError, match=r"other settings: batch_size"):
         other = BaselineTraining(augmentation="none", frames=110, batch_size=3, warmup=0, learning_rate=1e-2)
         train_baseline(_smallest("unet"), other, _Frames(110), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["projective", "elastic", "autoaugment"])
+def test_augmentations_warp_the_rendering_as_the_image(name: Augmentation, tmp_path: Path) -> None:
+    training = BaselineTraining(augmentation=name, frames=104, batch_size=16, threads=1)
+    run = _Run(_smallest("unet"), training, _Frames(104), tmp_path)
+    _, given, masks = run._batch()
+    assert len({float(mask.sum()) for mask in masks}) > 1
+    assert torch.equal(given[:, :1] > 0.5, masks > 0.5)
+
+
+def test_normals_turn_with_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    change = augmentation("autoaugment", np.random.default_rng(0))
+    assert isinstance(change, _AutoAugment)
+    monkeypatch.setattr(change._policy, "policies", [[("Rotate", 1.0, 9)]])
+    y, x = torch.meshgrid(torch.arange(-40.0, 41.0), torch.arange(-40.0, 41.0), indexing="ij")
+    maps = torch.stack([torch.ones_like(x), *3 * [torch.zeros_like(x)], x, y, torch.zeros_like(x)])
+    _, turned = change(torch.zeros(3, 81, 81, dtype=torch.uint8), maps)
+    assert not torch.equal(turned[0], maps[0])
+    assert torch.allclose(turned[4:6, 20:61, 20:61], maps[4:6, 20:61, 20:61], atol=1.0)
 
 
 def test_frames_are_made_once_and_are_the_same_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
