@@ -11,9 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from rich.console import Console
+from torch.nn import functional
 
 from ...console import Bar
 from ...evaluation import dice, joint_mae_deg, normalized_surface_distance
+from ...imaging.working_image import Window
 from ...model.keypoints import keypoints
 from ...model.parts import COVERAGE
 from ...model.perturbation import perturb
@@ -242,6 +244,15 @@ def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: 
     return optimizer.result().scene
 
 
+def fitted(image: tuple[int, int], size: tuple[int, int]) -> tuple[Window, tuple[int, int, int, int]]:
+    """Centred part of a network's input that an image fills with its aspect ratio, and the border on its left, right,
+    top and bottom [px]; arguments are widths and heights [px]."""
+    scale = min(size[0] / image[0], size[1] / image[1])
+    width, height = (max(round(scale * side), 1) for side in image)
+    left, top = (size[0] - width) // 2, (size[1] - height) // 2
+    return Window(left, top, width, height), (left, size[0] - width - left, top, size[1] - height - top)
+
+
 STEPS = 10
 """Number of steps for each frame after the first. TC-CaRTS (arXiv 2212.00072) reports far fewer steps than the 30 of
 CaRTS."""
@@ -339,22 +350,26 @@ class SourceBench:
     def _segment(self, run: Run, frame: Frame, truth: GroundTruth) -> Measurement:
         """Score the mask that a network predicts for one image at its training resolution.
 
-        The mask is scored at the resolution of the image. The input of networks with kinematics includes the rendering
-        at the measured joint positions.
+        The image is padded to the network's aspect ratio; the mask is scored at the resolution of the image. The input
+        of networks with kinematics includes the rendering at the measured joint positions.
         """
         extractor, trained = self._extractor, self._baselines.get(run.method)
         device, image = extractor.device, frame.images[truth.camera]
         scene = self._recording.scene.with_cameras([truth.camera])
         if trained is None:
-            network, size, kinematics = None, extractor.working_size, run.method == RENDERING
+            network, kinematics = None, run.method == RENDERING
+            size = extractor.weights["surface" if kinematics else "feature"].working_size
         else:
             network, settings = trained.network.to(device), trained.network.settings
             size, kinematics = settings.size, settings.uses_kinematics
-        renderer = Renderer(scene, width=size[0], height=size[1]) if kinematics else None
+        content, border = fitted(image.shape[1::-1], size)
+        renderer = Renderer(scene, width=content.width, height=content.height) if kinematics else None
         began = time.perf_counter()
         given = renderer and renderer.surface_maps(scene.state(frame.measured, mounts=frame.mounts)).to(device)
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        given = given if given is None else functional.pad(given, border, mode="replicate")
+        small = cv2.resize(image, (content.width, content.height), interpolation=cv2.INTER_AREA)
         tensor = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255.0
+        tensor = functional.pad(tensor, border, mode="replicate")
         with torch.no_grad():
             if network is not None:
                 probability = network(tensor, given).sigmoid()
@@ -362,7 +377,9 @@ class SourceBench:
                 probability = extractor.surface(tensor, given)[:, COVERAGE].sum(1, keepdim=True)
             else:
                 probability = extractor.probability(tensor)
-        full = cv2.resize(probability[0, 0].cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        full = cv2.resize(
+            content.of(probability[0, 0]).cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR
+        )
         score = truth.score_mask(full >= 0.5, time.perf_counter() - began)
         return Measurement(run, score, "not iterative", self._machine)
 
