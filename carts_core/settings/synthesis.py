@@ -26,7 +26,7 @@ class EndoscopeConfig(Ranged):
     focal_length: Annotated[float, Range(100, 5000)] = 560.0
     """Focal length for an image 640 px wide [px]; scaled for other widths."""
     distance: Annotated[float, Range(0.05, 10.0)] = 0.100
-    """Distance from the camera to the centre of the scene [m]; at most 0.3 for instruments."""
+    """Distance from the camera to the centre of the scene [m]; at most 0.16 for instruments."""
     elevation: Annotated[float, Range(0.5, 1.57)] = 1.05
     """Angle between the viewing direction and the tissue plane [rad]."""
     stereo: bool = False

@@ -22,7 +22,7 @@ from ...model.robot import Robot
 from ...model.scene import Arm
 from ...settings import EndoscopeConfig, MeasurementError, SynthesisConfig
 from .path_tracer import NEAR
-from .scene import WORK_POINTS, Tissue, rotation_between
+from .scene import CENTRE, WORK_POINTS, Tissue, rotation_between
 
 
 def measure(
@@ -60,6 +60,8 @@ _CONVERGED = 1e-9
 convergence."""
 _BORDER = 0.08
 """Minimum distance of the tips from the image border, as a share of the image size [1]."""
+_NEAREST, _FARTHEST = 0.55, 1.35
+"""Bounds of the depth of the tips, relative to that of the centre of the scene [1]."""
 _MARGIN = 0.1
 """Margin around the image within which collisions are checked, as a share of the image size [1]."""
 _INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
@@ -160,8 +162,7 @@ def _draw(
     """Random motion of one arm, within its joint limits and in view."""
     motion = config.motion
     targets = np.asarray(WORK_POINTS[number]) + _spline(config, rng, np.asarray(motion.reach))
-    if not in_view(targets, camera):
-        raise Rejected("a tip leaves the image")
+    check_view(targets, camera)
     joints = np.zeros((motion.frames, len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + _spline(config, rng, np.full(3, motion.wrist_range))
@@ -207,10 +208,13 @@ def check_clearance(
             raise Rejected("the instruments touch")
 
 
-def in_view(tips_world: np.ndarray, camera: Camera) -> bool:
-    """Whether tips stay in the image, away from its border, and at a working distance."""
-    depth = tips_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-    return bool((_seen(tips_world, camera, -_BORDER) & (depth > 0.055) & (depth < 0.135)).all())
+def check_view(tips_world: np.ndarray, camera: Camera) -> None:
+    """Raise `Rejected` if tips leave the image, come close to its border, or are not at a working distance."""
+    if not _seen(tips_world, camera, -_BORDER).all():
+        raise Rejected("a tip leaves the image")
+    *depths, centre = np.vstack([tips_world, CENTRE]) @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    if not (_NEAREST * centre < min(depths) and max(depths) < _FARTHEST * centre):
+        raise Rejected("a tip is too close to the camera or too far from it")
 
 
 def _seen(points_world: Float[np.ndarray, "n 3"], camera: Camera, margin: float) -> Bool[np.ndarray, " n"]:
@@ -243,8 +247,8 @@ def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.n
 
 ARM_NAME = "arm"
 
-INSTRUMENT_DISTANCE = 0.3
-"""Camera distance up to which the world is rendered at its true scale [m]."""
+INSTRUMENT_DISTANCE = 0.16
+"""Camera distance up to which the world is rendered at its true scale, since the tissue fills the image [m]."""
 
 _USUAL = 0.1
 """Distance of the camera in the reduced world [m]."""
@@ -302,8 +306,7 @@ def plan_arm(
                 f"the tip {tip_link!r} of {robot.urdf} coincides with its base. Give another --tip-link."
             )
         arm = _placed(robot, tip, camera, rng, scale)
-        if not in_view((tips @ arm.T_world_base[:3, :3].T + arm.T_world_base[:3, 3]) / scale, camera):
-            raise Rejected("the tip leaves the image")
+        check_view((tips @ arm.T_world_base[:3, :3].T + arm.T_world_base[:3, 3]) / scale, camera)
         seen = [points / scale for points in clouds(arm, joints, body)]
         check_clearance([seen], tissues, camera, config.motion.clearance)
         return arm, joints

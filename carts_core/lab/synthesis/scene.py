@@ -62,6 +62,9 @@ JOINT_TYPES = ("revolute", "revolute", "prismatic", "revolute", "revolute", "rev
 _REMOTE_CENTRES_CAMERA = ((-0.092, 0.062, 0.006), (0.098, -0.010, 0.002))
 """Points at which the instruments pass through the body wall, in the frame of the left camera [m]."""
 
+CENTRE = np.array([0.0, 0.0, 0.006])
+"""World point at the centre of the scene, at which the cameras look [m]."""
+
 WORK_POINTS = ((-0.011, -0.001, 0.014), (0.012, 0.002, 0.014))
 """World points at which the shafts point at zero joint positions, and about which the tips move [m]."""
 
@@ -71,7 +74,7 @@ def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
     forward = np.array([0.0, np.cos(config.elevation), -np.sin(config.elevation)])
     right = np.array([1.0, 0.0, 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
-    position = np.array([0.0, 0.0, 0.006]) - config.distance * forward
+    position = CENTRE - config.distance * forward
     focal = config.focal_length * config.width / 640.0
     names = ("left", "right") if config.stereo else ("left",)
     cameras = []

@@ -1,6 +1,7 @@
 """Scenes of synthetic sequences: cameras, tissue, arms and their motion."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -122,6 +123,24 @@ def test_a_plan_keeps_within_limits_touches_nothing_and_stays_in_view(
         state = renderer.scene.state({arm.name: positions[frame] for arm, positions in zip(arms, joints, strict=True)})
         ids = renderer.segment(state)[0]
         assert all((ids == arm).mean() > 0.01 for arm in range(2))
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.16])
+def test_instruments_move_at_every_allowed_distance(shipped_psm: Robot, flat_tissue: Tissue, distance: float) -> None:
+    config = replace(CONFIG, endoscope=EndoscopeConfig(distance=distance))
+    (camera,) = place_cameras(config.endoscope)
+    arms = place_arms(shipped_psm, config.tip_link, camera)
+    left, right = plan_motion(arms, [flat_tissue], camera, config)
+    assert left.shape == right.shape == (8, 7)
+
+
+def test_a_motion_in_depth_that_cannot_be_done_says_why(
+    arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue
+) -> None:
+    narrow = replace(camera, intrinsics=(50.0, 50.0, 320.0, 240.0))
+    config = SynthesisConfig(motion=MotionConfig(frames=8, reach=(0.001, 0.1, 0.1)))
+    with pytest.raises(SettingsError, match=r"a tip is too close to the camera or too far from it \(\d+\)"):
+        plan_motion(arms, [flat_tissue], narrow, config)
 
 
 def test_a_motion_that_cannot_be_done_says_why(arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue) -> None:

@@ -139,6 +139,8 @@ def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(
         assert 0.5 * DISTANCE < (T_camera_base @ tip)[2, 3] < 1.4 * DISTANCE, "in metres, and not in the small world's"
 
 
-def test_an_instrument_is_not_looked_at_from_a_metre_away(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"surgical instrument\. The limit for instruments is 0\.3 m"):
-        synthesize(_config(SynthesisConfig().robot), tmp_path / "sequence")
+@pytest.mark.parametrize("distance", [DISTANCE, 0.2])
+def test_an_instrument_is_not_looked_at_from_afar(tmp_path: Path, distance: float) -> None:
+    config = dataclasses.replace(_config(SynthesisConfig().robot), endoscope=EndoscopeConfig(distance=distance))
+    with pytest.raises(SettingsError, match=r"surgical instrument\. The limit for instruments is 0\.16 m"):
+        synthesize(config, tmp_path / "sequence")
