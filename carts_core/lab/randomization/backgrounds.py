@@ -1,6 +1,7 @@
 """Backgrounds of training images in display colours: tissue, rooms, cloth, boards, patterns and photographs."""
 
 import colorsys
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -8,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SettingsError
-from ...files.reading import IMAGE, read_bytes, size_problem
+from ...files.reading import IMAGE, check_regular, read_bytes, size_problem
 
 
 def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
@@ -44,11 +45,15 @@ _DARKEST = 0.25
 """Minimum mean brightness of photographs [1]: training data exclude low light."""
 
 
+_CACHED = 200
+"""Number of decoded photographs that are kept."""
+
+
 class Photographs:
-    """Generator of random crops of the image files in a folder and its subfolders.
+    """Generator of random crops of the image files in a folder and its subfolders, which are read on demand.
 
     Raises:
-        SettingsError: the folder has no image file, or an image file cannot be read.
+        SettingsError: the folder has no image file, or a file is no image.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,14 +62,20 @@ class Photographs:
             raise SettingsError(
                 f"{folder} has no photographs. Give a folder with at least one image file ({', '.join(_SUFFIXES)})."
             )
-        self._images = [_read(path) for path in paths]
+        for path in paths:
+            _check(path)
+        self._paths, self._read = paths, lru_cache(_CACHED)(_read)
 
     def __len__(self) -> int:
-        return len(self._images)
+        return len(self._paths)
 
     def __call__(self, rng: np.random.Generator, width: int, height: int) -> Image:
-        """Random crop of a photograph, rotated, mirrored, enlarged and with modified colours; RGB in [0, 1]."""
-        image = self._images[int(rng.integers(len(self._images)))]
+        """Random crop of a photograph, rotated, mirrored, enlarged and with modified colours; RGB in [0, 1].
+
+        Raises:
+            SettingsError: the photograph cannot be decoded.
+        """
+        image = self._read(self._paths[int(rng.integers(len(self._paths)))])
         rows, columns = image.shape[:2]
         if rng.random() < 0.5:
             image = image[:, ::-1]
@@ -92,6 +103,21 @@ class Photographs:
         return np.clip(image + max(_DARKEST - float(image.mean()), 0.0), 0, 1)
 
 
+def _check(path: Path) -> None:
+    """Check that a file begins as an image does; `SettingsError` otherwise."""
+    try:
+        check_regular(path, IMAGE)
+        known = cv2.haveImageReader(str(path))
+    except OSError:
+        known = False
+    if not known:
+        raise _unreadable(path)
+
+
+def _unreadable(path: Path) -> SettingsError:
+    return SettingsError(f"photograph {path} cannot be read. Replace or remove it.")
+
+
 def _read(path: Path) -> np.ndarray:
     try:
         content = read_bytes(path, IMAGE)
@@ -99,7 +125,7 @@ def _read(path: Path) -> np.ndarray:
     except (OSError, cv2.error):
         image = None
     if image is None:
-        raise SettingsError(f"photograph {path} cannot be read. Replace or remove it.")
+        raise _unreadable(path)
     scale = _LARGEST / max(image.shape[:2])
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

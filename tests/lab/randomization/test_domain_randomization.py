@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
+from carts_core.files.reading import Kind, read_bytes
 from carts_core.lab.randomization import (
     BACKGROUND,
     HEAD,
@@ -110,6 +111,26 @@ def test_photographs_are_found_in_subfolders_and_none_is_low_light(photographs: 
     images = [source(rng, *SIZE) for _ in range(20)]
     assert all(image.shape == (160, 192, 3) and 0 <= image.min() and image.max() <= 1 for image in images)
     assert min(float(image.mean()) for image in images) >= 0.24
+
+
+def test_photographs_are_read_on_demand_and_some_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    content = cv2.imencode(".png", np.full((9, 12, 3), 90, np.uint8))[1].tobytes()
+    for number in range(300):
+        (tmp_path / f"{number}.png").write_bytes(content)
+    read: list[Path] = []
+
+    def counting(path: Path, kind: Kind) -> bytes:
+        read.append(path)
+        return read_bytes(path, kind)
+
+    monkeypatch.setattr("carts_core.lab.randomization.backgrounds.read_bytes", counting)
+    source = Photographs(tmp_path)
+    assert len(source) == 300 and not read
+    for _ in range(2):
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            source(rng, 16, 12)
+    assert 0 < len(read) == len(set(read)) <= 20
 
 
 @pytest.mark.parametrize("content", [None, b"no image"])
