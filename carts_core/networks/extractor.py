@@ -49,7 +49,7 @@ class FeatureExtractor:
     Attributes:
         weights: weights read from the files, by kind: "feature" and "surface".
         sha256: fingerprint of both networks.
-        working_size: width and height [px] of the images for which the networks were trained.
+        working_size: width and height [px] of the images for which the feature network was trained.
         stride: width and height of an input must be multiples of this [px].
         channels: number of feature channels.
         device: device of the networks.

@@ -124,7 +124,7 @@ def instrument_probability(
 
     height, width = image.shape[:2]
     stride = extractor.stride
-    scale = extractor.working_size[0] / width
+    scale = extractor.weights["surface"].working_size[0] / width
     size = tuple(max(round(side * scale / stride), 1) * stride for side in (width, height))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
     images = torch.from_numpy(small).permute(2, 0, 1)[None].to(extractor.device)

@@ -17,9 +17,12 @@ from carts_core.cli.view import View
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.evaluation.metrics import dice
 from carts_core.networks import FeatureExtractor
+from carts_core.networks.surface import UNetSurface
+from carts_core.networks.weights import save_weights
 from carts_core.recording import Sequence
-from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter, onnx_segmenter
+from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter, instrument_probability, onnx_segmenter
 from carts_core.segmentation.onnx_segmenter import OnnxSegmenter
+from carts_core.settings import Architecture
 
 HEIGHT, WIDTH = 120, 160
 LEFT, RIGHT = (slice(30, 90), slice(20, 60)), (slice(20, 100), slice(100, 140))
@@ -49,6 +52,22 @@ def _roughly(*parts: tuple[slice, slice]) -> Segmenter:
 def test_a_click_gives_the_whole_thing_along_its_edges_and_nothing_else() -> None:
     found = _roughly(LEFT, RIGHT).segment(_two_bars(), Prompt(inside=((40.5, 60.5),)))
     assert dice(found, _mask(LEFT)) > 0.99 and not (found & _mask(RIGHT)).any()
+
+
+def test_a_network_gets_images_of_the_size_of_its_own_weights(
+    tmp_path: Path, small_architecture: Architecture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_weights(UNetSurface(small_architecture).eval(), tmp_path / "surface.safetensors", {}, (80, 64))
+    extractor, sizes = FeatureExtractor.load(tmp_path / "surface.safetensors"), list[torch.Size]()
+    surface = extractor.surface
+
+    def recording(images: Tensor, given: Tensor) -> Tensor:
+        sizes.append(images.shape[2:])
+        return surface(images, given)
+
+    monkeypatch.setattr(extractor, "surface", recording)
+    assert instrument_probability(extractor, _two_bars()).shape == (HEIGHT, WIDTH)
+    assert sizes == [(64, 80)]
 
 
 def test_two_clicks_give_both_things_and_a_point_beside_takes_one_away_again() -> None:
