@@ -105,7 +105,7 @@ class OnnxSurface:
         Raises:
             RuntimeError: ONNX Runtime cannot run the graph.
         """
-        inputs = {"images": images.contiguous().numpy(), "given": given.contiguous().numpy()}
+        inputs = {"images": images.detach().contiguous().numpy(), "given": given.detach().contiguous().numpy()}
         try:
             (maps,) = self._session.run(["maps"], inputs)
         except Exception as error:  # ONNX Runtime's errors have no narrower base class.

@@ -79,6 +79,12 @@ def test_onnx_predicts_what_torch_predicts(weights: Path, size: tuple[int, int],
     )
 
 
+def test_onnx_takes_images_that_require_gradients_as_torch_does(weights: Path) -> None:
+    images, given = torch.rand(1, 3, 16, 16, requires_grad=True), torch.rand(1, 6, 16, 16)
+    for inference in ("torch", "onnx"):
+        assert not FeatureExtractor.load(weights, inference=inference).surface(images, given).requires_grad
+
+
 @pytest.mark.gpu
 def test_a_gpu_predicts_what_a_cpu_predicts_and_gives_it_back_where_the_images_are() -> None:
     images, given = torch.rand(1, 3, 112, 208), torch.rand(1, 6, 112, 208)
