@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, get_worker_info
+from torch.utils.data import DataLoader, Dataset
 
 from ...settings import TrainingConfig
 from ...stopping import end_with_parent
@@ -39,10 +39,8 @@ class _Samples(Dataset):
         self._config, self._lanes = config, max(config.workers, 1)
         self._generators: dict[int, Any] = {}
         self._made: dict[tuple[int, int], Any] = {}
-        self._alone = False
 
     def __getitem__(self, number: int) -> Batch:
-        self._share_processor()
         config, task = self._config, task_of(self._config.network)
         batch, place = divmod(number, config.batch_size)
         lane, position = batch % self._lanes, batch // self._lanes * config.batch_size + place
@@ -68,12 +66,6 @@ class _Samples(Dataset):
             self._made.pop((lane, newest - _MEMORY), None)
         return self._made[key]
 
-    def _share_processor(self) -> None:
-        if self._alone or get_worker_info() is None:
-            return
-        share_processor()
-        self._alone = True
-
 
 class _CachedSamples(Dataset):
     """Data set of samples drawn from a cache by number, randomly changed and mirrored."""
@@ -87,8 +79,6 @@ class _CachedSamples(Dataset):
         if self._cache is None:
             assert config.cache is not None
             self._cache = ImageCache(config.cache, self._shards)
-            if get_worker_info() is not None:
-                share_processor()
         rng = np.random.default_rng((config.seed, _TRAINING_STREAM, number))
         size = config.crop or (config.images.width, config.images.height)
         sample = randomized(rng, self._cache, int(rng.integers(len(self._cache))), size)
@@ -104,8 +94,9 @@ def share_processor() -> None:
     os.nice(_NICENESS)
 
 
-def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
-    """Ignore signals to the process group, since the parent ends its workers after saving."""
+def _start_worker(closing: Event, parent: int, worker: int) -> None:
+    """Share the processor, and ignore signals to the process group, since the parent ends its workers after saving."""
+    share_processor()
     end_with_parent(parent, signal.SIGKILL)
 
     def end_if_closing(*_: object) -> None:
@@ -134,7 +125,7 @@ def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterat
         num_workers=config.workers,
         prefetch_factor=2 if config.workers else None,
         multiprocessing_context=spawning if config.workers else None,
-        worker_init_fn=partial(_outlive_signals, closing, os.getpid()) if config.workers else None,
+        worker_init_fn=partial(_start_worker, closing, os.getpid()) if config.workers else None,
     )
     batches = _stream(loader)
     try:
