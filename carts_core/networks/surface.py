@@ -31,9 +31,14 @@ class SurfaceLogits:
     """Mean unit normals times coverage."""
 
     @one_thread()
+    def parts(self) -> Float[Tensor, "batch parts h w"]:
+        """Coverage of each part as probability."""
+        return self.coverage.softmax(1)[:, 1:]
+
+    @one_thread()
     def map(self) -> Float[Tensor, "batch 6 h w"]:
         """Surface map, with coverage as probabilities."""
-        return torch.cat([self.coverage.softmax(1)[:, 1:], self.normals], 1)
+        return torch.cat([self.parts(), self.normals], 1)
 
 
 STAGES = ((1, 16, 1, 1, 3), (6, 24, 2, 2, 3), (6, 40, 2, 2, 5), (6, 80, 3, 2, 3), (6, 112, 3, 1, 5))

@@ -266,7 +266,7 @@ class SurfaceTask:
         terms = {
             "everywhere": entropy.mean(),
             "near": weighted_mean(entropy, near),
-            "dice": soft_dice_loss(predicted.map()[:, COVERAGE], coverage),
+            "dice": soft_dice_loss(predicted.parts(), coverage),
             "normals": weighted_mean(difference.sum(1), near),
         }
         return _weighted(terms, config.surface_objective), terms
