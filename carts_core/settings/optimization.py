@@ -213,8 +213,7 @@ class DescentSolver(Ranged):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "loss", _loss(self.loss))
-        methods = ("adam", "gradient_descent")
-        require(self.method in methods, "method", self.method, " or ".join(methods))
+        require(self.method in get_args(Method), "method", self.method, " or ".join(get_args(Method)))
         of_kind = len(self.stages) > 0 and all(isinstance(stage, FirstOrder) for stage in self.stages)
         require(of_kind, "stages", self.stages, "one or more FirstOrder stages")
 
