@@ -153,8 +153,8 @@ class SynthesisConfig(Ranged):
     robot: Path = field(default_factory=shipped_robot)
     """URDF, or `builtin:NAME`. A robot with the joints of a PSM is used for two arms, other robots for a single arm."""
     tip_link: str = "tool_tip_link"
-    """Link of the URDF whose origin is the point between the jaw tips; for robots other than the PSM, by default the
-    last link with a mesh."""
+    """Link of the URDF whose origin is the point between the jaw tips; for robots other than the PSM, the default means
+    the last link with a mesh."""
     domains: tuple[str, ...] = DOMAINS
     """Conditions to render."""
     endoscope: EndoscopeConfig = EndoscopeConfig()
