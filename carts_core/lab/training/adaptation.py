@@ -282,8 +282,8 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
             recording, and the default steps by `STEPS` if there is no time limit.
 
     Raises:
-        SettingsError: another network is to be trained, `given` names a recording or includes random robots, or `output`
-            holds a run with another recording.
+        SettingsError: another network is to be trained, `given` names a recording or includes random robots, or
+            `output` holds a run with another recording.
         SequenceError: the recording cannot be read.
         WeightsError: the checkpoint in `output` cannot be read.
         OutputError: `output` cannot be written to.
