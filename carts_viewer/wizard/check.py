@@ -23,7 +23,7 @@ from carts_core.recording.sources.folder import kinematics_table
 from carts_core.settings.interchange import NO_TABLE, AngleUnit, ImportOptions, LengthUnit
 from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.transport.document import render
-from carts_viewer.wizard.draft import Draft
+from carts_viewer.wizard.draft import MEANINGS, Draft
 
 _COLORS = ("#2dd4a7", "#60a5fa", "#facc15", "#e879f9", "#fb923c", "#f87171", "#a3a3a3")
 _WIDTH, _HEIGHT = 600, 150
@@ -80,10 +80,6 @@ _WHOLE: tuple[Part, str] = ("recording", "")
 """Key of problems of the recording as a whole."""
 
 
-_ROLES = (*JOINT_NAMES, "jaw", "time", "frame")
-"""Meanings that a column can be given."""
-
-
 def _label(role: str) -> str:
     """Meaning of a column, as text."""
     return "image" if role == "frame" else role.replace("_", " ")
@@ -133,7 +129,7 @@ class Guess:
         taken = (self.meanings.time, self.meanings.frame)
         numbers = [name for name, values in self.table.columns.items() if values.dtype.kind in "iuf"]
         free = [name for name in numbers if name not in taken]
-        return dict(zip(_ROLES, free, strict=False)) if len(free) in (len(JOINT_NAMES), len(JOINT_NAMES) + 1) else {}
+        return dict(zip(MEANINGS, free, strict=False)) if len(free) in (len(JOINT_NAMES), len(JOINT_NAMES) + 1) else {}
 
     def described(self, options: ImportOptions) -> list["Column"]:
         """The columns of the table, those with a meaning first."""
@@ -152,7 +148,7 @@ class Guess:
             origin = "by name" if self.meanings is not None and name in self.meanings.stated else "guessed"
             guess = "" if name in chosen or name not in found else f"{_label(found[name])} ({origin})"
             places = dict.fromkeys((0, len(values) // 2, len(values) - 1))
-            role = chosen.get(name) or (found.get(name) if found.get(name) in _ROLES else None) or ""
+            role = chosen.get(name) or (found.get(name) if found.get(name) in MEANINGS else None) or ""
             rows.append(Column(name, tuple(sample(values[row]) for row in places), chosen.get(name, ""), guess, role))
         return sorted(rows, key=lambda row: not (row.chosen or row.guess))
 
@@ -332,7 +328,7 @@ def check_form(
         estimating=estimating,
         trials={str(trial): trial.stem for trial in guess.trials},
         curves=curves,
-        roles={role: _label(role) for role in _ROLES},
+        roles={role: _label(role) for role in MEANINGS},
         joints=(*JOINT_NAMES, "jaw"),
         angles=get_args(AngleUnit),
         lengths=get_args(LengthUnit),

@@ -199,7 +199,8 @@ _OF_TABLES = (
 _CAMERA_PARTS = ("images", "calibration", "calibration_size")
 """Options of each camera, which determine its undistorted images."""
 _NUMBERS = ("time_offset", "frame_rate", "row_rate", "tool_point")
-_MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
+MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
+"""Meanings that a column of a table can be given."""
 
 
 def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> Draft | None:
@@ -231,9 +232,7 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
     elif name == "no-table":
         defaults = ImportOptions()
         options |= {name: getattr(defaults, name) for name in _OF_TABLES} | {"kinematics": NO_TABLE}
-    elif kind == "column" and which in _MEANINGS:
-        options["columns"] = _columns(draft, which, value, guessed)
-    elif kind == "meaning" and (not value or value in _MEANINGS):
+    elif kind == "meaning" and (not value or value in MEANINGS):
         chosen = {role: column for role, column in draft.options.columns.items() if column != which}
         options["columns"] = _columns(draft.with_options(columns=chosen), value, which, guessed) if value else chosen
     elif name == "remove-camera":

@@ -81,7 +81,7 @@ def test_a_table_of_unknown_columns_is_shown_with_values_and_the_cameras_stay(tm
         and "64 × 48" in form
         and " --" not in form
     )
-    joints = [(f"column {joint}", f"{letter} thing") for joint, letter in zip(JOINT_NAMES, "abcdef", strict=True)]
+    joints = [(f"meaning {letter} thing", joint) for joint, letter in zip(JOINT_NAMES, "abcdef", strict=True)]
     _, found = after(draft, *joints)
     assert found.recording is not None and not found.problems
     assert found.recording.arms[0].values is not None and found.recording.arms[0].values[0] == pytest.approx(JOINTS)
@@ -124,7 +124,7 @@ def test_columns_that_were_chosen_or_named_are_not_called_guessed(tmp_path: Path
     assert "yaw (by name)" in form and "(guessed)" not in form
     draft = recording(tmp_path / "numbered", [f"q{number}" for number in range(6)], JOINTS)
     assert "yaw (guessed)" in check_form(draft, guess(draft), {})
-    chosen = after(draft, *((f"column {joint}", f"q{number}") for number, joint in enumerate(JOINT_NAMES)))
+    chosen = after(draft, *((f"meaning q{number}", joint) for number, joint in enumerate(JOINT_NAMES)))
     assert "(guessed)" not in check_form(*chosen, {})
 
 
