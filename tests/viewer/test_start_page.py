@@ -21,7 +21,6 @@ from carts_core.batch.results import review_project
 from carts_core.cli.batch_job import BatchWork
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import output_path
-from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project import JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
 from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
@@ -32,7 +31,7 @@ from carts_viewer.start.site import Site
 from carts_viewer.start.start_page import StartPage, recent_projects, thumbnail
 from carts_viewer.transport.document import escaped, render
 from carts_viewer.transport.events import Chosen
-from carts_viewer.wizard.draft import Draft, DraftFile, Step, delete_draft, drafts
+from carts_viewer.wizard.draft import ClickedPoint, Draft, DraftFile, Step, delete_draft, drafts
 from carts_viewer.wizard.wizard import RecordingWizard
 
 
@@ -215,7 +214,7 @@ def test_a_draft_is_the_same_after_it_was_written_and_read() -> None:
         images={"left": "/a/b"}, calibration={"left": Path("/a/l.yaml")}, kinematics=Path("/a/k.csv"), flip=("yaw",),
         columns={"yaw": "q1"}, angle_unit="deg", time_offset=0.25, robot={"PSM1": "/r.urdf"},
     )  # fmt: skip
-    point = ImagePoint(3, "left", "PSM1", "tip", (1.5, 2.25))
+    point = ClickedPoint(3, "left", "PSM1", "tip", (1.5, 2.25), "0003")
     draft = Draft(Step.HAND_EYE, "/a", "name", options, (point,), True, {"arms": {"PSM1": [[1.0]]}})
     assert Draft.from_json(draft.to_json()) == draft
 
