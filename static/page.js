@@ -466,11 +466,12 @@
   }
 
   // ---- Return the keyboard to the page after a list, a box or a button was used with the pointer ------------------------
+  // A mark of a clicked point keeps it, to be moved by keys.
 
   let presses = 0;
   window.addEventListener("pointerdown", () => { presses += 1; }, { capture: true });
   window.addEventListener("click", (event) => {
-    const used = event.target instanceof Element && event.target.closest("[role=option], button, input[type=checkbox]");
+    const used = event.target instanceof Element && event.target.closest("[role=option], button:not(.mark), input[type=checkbox]");
     if (!used || event.detail === 0 || used.closest("dialog, [role=dialog]")) return;
     const list = used.matches("[role=option]"); // its field keeps the focus, though typing has ended
     const end = performance.now() + (list ? 500 : 60); // a list takes the focus back when it closes, possibly late
@@ -478,7 +479,7 @@
     const leave = () => {
       if (press !== presses) return; // another control is in use
       const focused = document.activeElement;
-      if (focused?.matches(list ? "input[aria-haspopup=listbox]" : "button, input[type=checkbox]")) focused.blur();
+      if (focused?.matches(list ? "input[aria-haspopup=listbox]" : "button:not(.mark), input[type=checkbox]")) focused.blur();
       if (performance.now() < end) setTimeout(leave, 60);
     };
     setTimeout(leave, 60);

@@ -151,7 +151,8 @@ def test_a_held_arrow_key_moves_a_point_by_all_its_steps_as_one_undo_step(
     visitor.point_at((160.0, 120.0), (320, 240))
     visitor.button("tip").click()
     (point,) = place.draft.points
-    page.locator(".mark").focus()
+    page.locator(".mark").click()
+    page.wait_for_timeout(200)
     for _ in range(20):
         page.keyboard.down("ArrowRight")
     page.keyboard.up("ArrowRight")
