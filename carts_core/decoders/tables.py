@@ -97,6 +97,12 @@ def extended_parquet(path: Path, columns: dict[str, list[Any]]) -> bytes:
     return content.getvalue()
 
 
+def text_column(texts: np.ndarray) -> list[Any]:
+    """Column of `extended_parquet` with texts [rows]."""
+    distinct, index = np.unique(texts, return_inverse=True)
+    return ["texts", distinct.tolist(), index.astype(np.int64)]
+
+
 def _arrow(kind: str, values: Any, index: np.ndarray | None = None) -> Any:
     """Arrow array of a column of `extended_parquet`."""
     import pyarrow  # noqa: PLC0415 - an extra

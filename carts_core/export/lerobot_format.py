@@ -234,9 +234,7 @@ def _columns(
     if results.maps:
         found[CORRECTED_STATE] = ["numbers", _state(recorded, own, results).astype(results.state_type)]
     found |= {POSITIONS: ["numbers", positions], STD: ["numbers", std], CORRECTED: ["numbers", corrected]}
-    for name, texts in ((SOURCE, sources), (VERDICT, verdicts)):
-        distinct, index = np.unique(texts, return_inverse=True)
-        found[name] = ["texts", distinct.tolist(), index.astype(np.int64)]
+    found |= {SOURCE: tables.text_column(sources), VERDICT: tables.text_column(verdicts)}
     for masks in results.masks:
         files, index = _earlier_masks(recorded, masks, rows, own)
         for number, row in masks.rows.items() if len(own) else ():

@@ -191,8 +191,7 @@ def _write_packed(root: Path, folder: OutputPath, arm: str, dataset: Dataset, re
         def texts(values: list[str]) -> list[Any]:
             column = np.full(count, "", object)
             column[rows] = values
-            distinct, index = np.unique(column, return_inverse=True)
-            return ["texts", distinct.tolist(), index.astype(np.int64)]
+            return tables.text_column(column)
 
         corrected = np.array([frame.source != "measured" for frame in dataset.frames], float)
         columns = {
