@@ -191,7 +191,7 @@ def test_another_recording_of_the_same_name_does_not_resume_the_run(
     table.write_text(table.read_text().replace("0.15", "0.16"))
     cv2.imwrite(str(image), np.zeros((72, 96, 3), np.uint8))
     with pytest.raises(SettingsError, match=r"other settings: recording_digest was \w+ and is \w+\. .* another output"):
-        adapted_to(recording, tmp_path / "adapted", TrainingConfig())
+        adapted_to(recording, tmp_path / "adapted", ADAPTATION_SETTINGS)
     assert {path: path.read_bytes() for path in (tmp_path / "adapted").rglob("*.*")} == before
 
 
