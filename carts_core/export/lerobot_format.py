@@ -378,4 +378,4 @@ def _description(results: _Results) -> str:
         "corrected_columns": {name: meanings[name] for name in results.state.columns if name in meanings},
         "recorded_columns": [name for name in results.state.columns if name not in meanings],
     }
-    return json.dumps(content, indent=1, ensure_ascii=False)
+    return json.dumps(content, indent=1)
