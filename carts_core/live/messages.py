@@ -24,6 +24,8 @@ from ..recording.kinematics_table import PLAUSIBLE
 LARGEST = 64 * 2**20
 """Maximum size of a message [bytes]."""
 _LENGTH = struct.Struct(">I")
+_NEXT = 0.5
+"""Maximum time for which an outdated frame is held back until the next one arrives [s]."""
 
 
 class StreamError(CartsError):
@@ -315,22 +317,25 @@ class LatestFrame:
         """Wait for the latest frame; None at the end of the stream.
 
         Args:
-            patience: waiting time after which a frame is dropped, unless it is the last frame [s].
+            patience: age beyond which a frame is held back until the next one arrives, for at most `_NEXT` [s]. The
+                frame that is then the latest is returned whatever its age.
 
         Raises:
             CartsError: the source failed.
         """
+        waited = False
         with self._changed:
             while True:
-                moment, self._moment = self._moment, None
-                if moment is not None and (self._ended or time.monotonic() - moment.arrived <= patience):
+                moment = self._moment
+                if moment is not None and (waited or self._ended or time.monotonic() - moment.arrived <= patience):
+                    self._moment = None
                     return moment
-                self.dropped += moment is not None
                 if self._ended:
                     if self._error is not None:
                         raise self._error
                     return None
-                self._changed.wait(0.5)
+                self._changed.wait(_NEXT)
+                waited = moment is not None
 
     @property
     def interval(self) -> float:

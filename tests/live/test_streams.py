@@ -147,6 +147,17 @@ def test_a_frame_that_would_be_too_old_is_not_tracked(sequence: Sequence, second
     assert (statistics.dropped, statistics.tracked) == (1, 2) and "late" not in {one.frame_id for one in tracker.frames}
 
 
+def test_frames_that_all_arrive_late_are_tracked_nevertheless(sequence: Sequence) -> None:
+    """As on a machine that needs longer to decode an image than the tracker leaves."""
+    tracker, late = Repeater(sequence, 20.0), StreamFrame(sequence.frame(0), arrived=time.monotonic() - 30.0)
+
+    def after(count: int) -> Callable[[], object]:
+        return lambda: eventually(lambda: len(tracker.frames) == count)
+
+    follow(Given(tracker, *((after(count), late) for count in range(3))), tracker, [])  # pyright: ignore
+    assert len(tracker.frames) == 3
+
+
 def test_what_ends_a_source_is_raised_where_frames_are_taken(sequence: Sequence) -> None:
     class Broken:
         def __iter__(self) -> Iterator[StreamFrame]:
