@@ -62,7 +62,7 @@ lock: ## Pin all packages except PyTorch by hash, after a change of constraints.
 # Lock for all systems and Python versions, including the build backend; existing pins are kept if possible. PyTorch and
 # the packages of its CUDA build are omitted, since their hashes depend on the index; see .ci/setup.py.
 define locked
-	printf 'hatchling\neditables\n' | .lock/bin/uv pip compile -q --universal --python-version 3.11.5 --generate-hashes \
+	printf 'hatchling\neditables\n' | .lock/bin/uv pip compile -q --universal --python-version 3.11.0 --generate-hashes \
 	--no-annotate --no-header -c constraints.txt $(2) pyproject.toml - -o $(1)
 	awk '/^[^ ]/ { kept = !/^(torch=|triton=|nvidia-|cuda-)/ } kept' $(1) > $(1).new && mv $(1).new $(1)
 endef
