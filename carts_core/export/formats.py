@@ -216,16 +216,16 @@ def export(
         ExportCancelled: `progress` was cancelled.
         CartsError: the output exists or cannot be written, or required data is missing.
     """
-    chosen = FORMATS[name]
+    chosen, progress = FORMATS[name], progress or ExportProgress()
     if chosen.suffix:
         if Path(output).suffix.lower() != chosen.suffix:
             output = output.parent / (output.name + chosen.suffix)
         with published_file(output, overwrite=overwrite) as path:
-            chosen.write(dataset, path, progress or ExportProgress())
+            chosen.write(dataset, path, progress)
         return Path(output)
-    with published(output, overwrite=overwrite) as path:
+    with published(output, overwrite=overwrite, pause=progress.pause) as path:
         dataset = replace(dataset, refine=dataset.refine if chosen.refines else None, rendered_folder=path / "rendered")
-        chosen.write(dataset, path, progress or ExportProgress())
+        chosen.write(dataset, path, progress)
         write_text(path / MARKER, _summary(dataset, name))
     return Path(output)
 

@@ -15,7 +15,7 @@ import shutil
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -445,7 +445,13 @@ _OLD = "carts-replaced"
 
 
 @contextmanager
-def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | None = None) -> Iterator[OutputPath]:
+def published(
+    target: OutputPath | Path,
+    *,
+    overwrite: bool = False,
+    key: str | None = None,
+    pause: Callable[[], None] | None = None,
+) -> Iterator[OutputPath]:
     """Write an output that replaces `target` when the block ends without an exception.
 
     The output is written in a hidden folder with a random name beside `target`. If the block fails or is interrupted,
@@ -456,6 +462,8 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
         overwrite: replace an existing file, or a folder written by an export without a project in it.
         key: fingerprint of the inputs. If given, partial output is kept if the block fails, and a later call with the
             same key continues with the partial output.
+        pause: called after each file is synchronized to disk, before the target is replaced; an exception counts as one
+            of the block.
 
     Yields:
         Path with the target's name, for a file or a folder; it does not exist yet without `key`.
@@ -469,8 +477,8 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
         try:
             _check_free(folder, output, overwrite)
             yield replace(output, names=(*output.names[:-1], staging.name, output.name), draft=key is None)
+            _sync(staging.descriptor, output.name, pause)
             _check_free(folder, output, overwrite)
-            _sync(staging.descriptor, output.name)
             _move(staging, folder, output.name)
             os.fsync(folder)
             key = None
@@ -547,8 +555,8 @@ def _below(folder: int, name: str) -> Iterator[int]:
         os.close(descriptor)
 
 
-def _sync(folder: int, name: str) -> None:
-    """Synchronize an output in an open folder to disk, including its content."""
+def _sync(folder: int, name: str, pause: Callable[[], None] | None) -> None:
+    """Synchronize an output in an open folder to disk, including its content; `pause` is called after each file."""
     found = status(folder, name)
     if found is not None and not stat.S_ISDIR(found.st_mode):
         _sync_file(folder, name)
@@ -558,6 +566,8 @@ def _sync(folder: int, name: str) -> None:
             found = status(descriptor, file)
             if found is not None and not stat.S_ISLNK(found.st_mode):
                 _sync_file(descriptor, file)
+                if pause is not None:
+                    pause()
         os.fsync(descriptor)
 
 

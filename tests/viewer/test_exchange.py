@@ -1,6 +1,8 @@
 """Exports of the page, imported masks and keypoints, and the target of a run."""
 
 import json
+import os
+import stat
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -150,6 +152,28 @@ def test_cancelling_leaves_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch) 
         assert desk.state.export is None and desk.wait_time() is None
         assert list(folder.glob("*")) == [] and not desk.saved.exports
     exported(desk, intents.Export("coco", "All"))
+
+
+def test_other_tabs_go_on_between_files_that_are_synchronized_and_cancelling_there_leaves_nothing(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synchronized, fsync = list[int](), os.fsync
+
+    def counted(descriptor: int) -> None:
+        if threading.current_thread().name == "carts-export" and stat.S_ISREG(os.fstat(descriptor).st_mode):
+            synchronized.append(descriptor)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", counted)
+    monkeypatch.setattr(exporting, "_TIME_SLICE", 0.0)
+    desk.do(intents.Export("masks", "All"))
+    for count in (1, 2):
+        while not synchronized[count - 1 :]:
+            desk.advance()
+        assert len(synchronized) == count
+    desk.do(intents.CancelExport())
+    assert desk.state.export is None and len(synchronized) == 2
+    assert list(desk.session.editor.project.path.with_name("sequence_exports").glob("*")) == []
 
 
 def test_what_no_page_of_ours_offers_is_refused(desk: Desk) -> None:
