@@ -26,6 +26,7 @@ from .writing import published as published
 from .writing import published_file as published_file
 from .writing import remove_file as remove_file
 from .writing import set_aside as set_aside
+from .writing import synchronize as synchronize
 from .writing import text_of_cell as text_of_cell
 from .writing import try_lock as try_lock
 from .writing import write_bytes as write_bytes

@@ -62,16 +62,16 @@ supported.
 """
 
 
-def write_bytes(path: OutputPath | Path, content: bytes) -> None:
+def write_bytes(path: OutputPath | Path, content: bytes, *, sync: bool = True) -> None:
     """Write a file atomically; missing folders are created.
 
-    Readers see either the complete old or the complete new file, even after a crash of the process or machine. If
-    the path is a link, the link is replaced and its target is unchanged.
+    Readers see either the complete old or the complete new file, even after a crash of the process or, with `sync`, of
+    the machine. If the path is a link, the link is replaced and its target is unchanged.
 
     Raises:
         OutputError: the file cannot be written, and nothing was changed.
     """
-    with output_stream(path) as stream:
+    with output_stream(path, sync=sync) as stream:
         stream.write(content)
 
 
@@ -118,8 +118,9 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
 
 
 @contextmanager
-def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
-    """Open a seekable, readable stream that becomes the file if the block succeeds; errors as in `write_bytes`."""
+def output_stream(path: OutputPath | Path, *, sync: bool = True) -> Iterator[BinaryIO]:
+    """Open a seekable, readable stream that becomes the file if the block succeeds; `sync` and errors as in
+    `write_bytes`."""
     output = as_output(path)
     with explained(output), opened_folder(output.parent, make=True) as folder:
         if output.draft:
@@ -135,7 +136,8 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
             with os.fdopen(descriptor, "w+b") as stream:
                 yield stream
                 stream.flush()
-                os.fsync(stream.fileno())
+                if sync:
+                    os.fsync(stream.fileno())
                 if temporary is None:
                     temporary = _random_name()
                     _link(stream.fileno(), folder, temporary)
@@ -145,7 +147,8 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
                 with suppress(FileNotFoundError):
                     os.unlink(temporary, dir_fd=folder)
             raise
-        os.fsync(folder)
+        if sync:
+            os.fsync(folder)
 
 
 def write_link(path: OutputPath, target: Path) -> None:
@@ -180,6 +183,21 @@ def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> N
                 os.fsync(stream.fileno())
         if length == 0 and sync:
             os.fsync(folder)
+
+
+def synchronize(folder: OutputPath) -> None:
+    """Synchronize all files of a folder's file system to disk, such as those written without `sync`.
+
+    Raises:
+        OutputError: the folder is missing, or the disk reports an error.
+    """
+    with explained(folder), opened_folder(folder) as descriptor:
+        system = ctypes.CDLL(None, use_errno=True)
+        if not hasattr(system, "syncfs"):
+            os.sync()
+        elif system.syncfs(descriptor) != 0:
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code))
 
 
 def pipe_stream(path: Path) -> BinaryIO:

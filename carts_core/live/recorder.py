@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import OutputError
 from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
-from ..files import append_line, file_name, output_path, remove_file, write_bytes, write_text
+from ..files import OutputPath, append_line, file_name, output_path, remove_file, synchronize, write_bytes, write_text
 from ..files.reading import SEQUENCE, parse_toml, read_text
 from ..model.camera import HALF_PIXEL
 from ..model.instruments import SCHEME
@@ -54,7 +54,9 @@ class Recorder:
     The folder contains `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
     corrected joints, `camera_CAMERA.csv` with the poses of each camera mount, `sequence.toml`, and at the end the
     project `sequence.carts`. The images of a frame are written before its rows. If the arms are lost, the measured
-    joints are written with the verdict *failed*.
+    joints are written with the verdict *failed*. Files are synchronized to disk at the end, since a hard disk performs
+    few synchronizations per second; a crash of the machine may lose or damage the last
+    half minute.
 
     Args:
         sequence: sequence with the arms and cameras.
@@ -133,6 +135,11 @@ class Recorder:
                 except Exception as error:  # The stream continues.
                     _log.warning("Recording has stopped: %s", error)
                     self._error = error
+        if self._edits:
+            try:
+                synchronize(self._output)
+            except OutputError as error:
+                self._error = self._error or error
 
     def _describe(self) -> None:
         """Write the sequence file, and update it when a camera begins to move."""
@@ -144,10 +151,10 @@ class Recorder:
         for camera in self._scene.cameras:
             path = self._output / _motion_file(camera.name)
             if number == 0:
-                append_line(path, ",".join(["frame", *POSITION, *ORIENTATION]).encode())
+                _append(path, ",".join(["frame", *POSITION, *ORIENTATION]).encode())
             T = mounts.get(camera.name, np.eye(4))
             values = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
-            append_line(path, ",".join([name, *(f"{value:.9f}" for value in values)]).encode())
+            _append(path, ",".join([name, *(f"{value:.9f}" for value in values)]).encode())
         if not mounts.keys() <= self._moving:
             self._moving |= mounts.keys()
             self._describe()
@@ -157,20 +164,20 @@ class Recorder:
         name = f"{number:06d}"
         for camera, image in frame.images.items():
             content = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-            write_bytes(self._output / "images" / file_name(camera) / f"{name}.png", content)
+            write_bytes(self._output / "images" / file_name(camera) / f"{name}.png", content, sync=False)
         lost, verdict = estimate.verdict is LiveVerdict.LOST, _VERDICTS[estimate.verdict]
         measured = KinematicsRow(name, "measured", frame.measured, {}, verdict.verdict)
         corrected = KinematicsRow(name, "optimized", estimate.joint_positions, estimate.joint_std, verdict.verdict)
         lines = kinematics_csv(self._scene, [measured if lost else corrected]).splitlines()
         if number == 0:
             columns = ",".join(["frame", "time", *joint_columns(self._scene)])
-            append_line(self._output / "kinematics.csv", columns.encode())
-            append_line(self._output / "corrected.csv", lines[0].encode())
+            _append(self._output / "kinematics.csv", columns.encode())
+            _append(self._output / "corrected.csv", lines[0].encode())
         self._write_mounts(number, name, tracked)
         positions = (f"{value:.9f}" for value in position_values(self._scene, measured))
         values = ",".join([name, f"{estimate.time:.6f}", *positions])
-        append_line(self._output / "kinematics.csv", values.encode())
-        append_line(self._output / "corrected.csv", lines[1].encode())
+        _append(self._output / "kinematics.csv", values.encode())
+        _append(self._output / "corrected.csv", lines[1].encode())
         edits: dict[Key[Any], Any] = {Key.verdict(number): verdict}
         if not lost:
             for arm in self._scene.arms:
@@ -178,6 +185,10 @@ class Recorder:
                 joints = tuple(float(value) for value in estimate.joint_positions[arm.name])
                 edits[Key.joints(number, arm.name)] = JointCorrection(joints, self._provenance, std)
         self._edits.append(edits)
+
+
+def _append(path: OutputPath, line: bytes) -> None:
+    append_line(path, line, sync=False)
 
 
 def _motion_file(camera: str) -> str:

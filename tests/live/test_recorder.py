@@ -1,5 +1,8 @@
 """A stream of a camera that moves, on disk."""
 
+import os
+import stat
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +13,7 @@ from moving import swing
 
 from carts_core.errors import OutputError
 from carts_core.export.kinematics import read_kinematics_csv
-from carts_core.files import OutputPath, write_bytes
+from carts_core.files import OutputPath, synchronize, write_bytes
 from carts_core.live.loop import Tracked
 from carts_core.live.messages import StreamFrame
 from carts_core.live.recorder import Recorder
@@ -72,10 +75,10 @@ def test_frames_before_a_write_error_are_recorded_with_their_corrections(
 ) -> None:
     sequence, folder = Sequence.open(tiny_sequence(frames=3)), tmp_path / "recorded"
 
-    def full(path: OutputPath, content: bytes) -> None:
+    def full(path: OutputPath, content: bytes, **options: bool) -> None:
         if path.path.name == "000002.png":
             raise OutputError("No space left on device.")
-        write_bytes(path, content)
+        write_bytes(path, content, **options)
 
     monkeypatch.setattr("carts_core.live.recorder.write_bytes", full)
     with pytest.raises(OutputError, match=r"No space left.* The 2 frames before this error are in .*recorded"):
@@ -83,6 +86,39 @@ def test_frames_before_a_write_error_are_recorded_with_their_corrections(
     project = Project.open(Sequence.open(folder / "sequence.toml"), folder / "sequence.carts", read_only=True)
     assert [len(project.state.joints(index)) for index in range(2)] == [1, 1]
     project.close()
+
+
+def test_frames_do_not_wait_for_the_disk_which_has_all_of_them_at_the_end(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited, fsync, folder, at_the_end = list[str](), os.fsync, tmp_path / "recorded", list[str]()
+
+    def noted(descriptor: int) -> None:
+        if threading.current_thread().name == "carts-live-recorder" and stat.S_ISREG(os.fstat(descriptor).st_mode):
+            waited.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+        fsync(descriptor)
+
+    def synchronized(output: OutputPath) -> None:
+        at_the_end.extend(sorted(path.name for path in output.path.rglob("*") if path.is_file()))
+        synchronize(output)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr("carts_core.live.recorder.synchronize", synchronized)
+    record(Sequence.open(tiny_sequence(frames=2)), folder, [{}, {}])
+    assert not waited
+    tables = ["camera_left.csv", "corrected.csv", "kinematics.csv", "sequence.toml"]
+    assert at_the_end == ["000000.png", "000001.png", *tables]
+
+
+def test_a_disk_that_fails_at_the_end_is_an_error(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(output: OutputPath) -> None:
+        raise OutputError(f"{output} cannot be written (Input/output error).")
+
+    monkeypatch.setattr("carts_core.live.recorder.synchronize", failing)
+    with pytest.raises(OutputError, match=r"Input/output error.* The 2 frames before this error are in .*recorded"):
+        record(Sequence.open(tiny_sequence(frames=2)), tmp_path / "recorded", [{}, {}])
 
 
 def test_a_camera_that_stays_is_recorded_without_a_motion(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
