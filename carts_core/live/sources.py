@@ -1,6 +1,7 @@
 """Sources of live streams: cameras, recordings, and a network server."""
 
 import logging
+import os
 import queue
 import socket
 import threading
@@ -188,7 +189,8 @@ _log = logging.getLogger(__name__)
 _NAMED = 20
 """Maximum number of unusable frames that are logged."""
 _POLL = 0.01
-"""Polling interval of a folder [s]."""
+"""Interval between listings of a folder [s]; at least the duration of a listing."""
+_MESSAGE = ".json"
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -313,9 +315,11 @@ class Folder(_Closable):
 
     def __iter__(self) -> Iterator[StreamFrame]:
         """See `Source`."""
-        seen = ""
-        while not self._closed.wait(_POLL):
-            newest = max((path.stem for path in self._folder.glob("*.json")), default="")
+        seen, pause = "", _POLL
+        while not self._closed.wait(pause):
+            began = time.monotonic()
+            newest = self._newest()
+            pause = max(_POLL, time.monotonic() - began)
             if newest <= seen:
                 continue
             seen, arrived = newest, time.monotonic()
@@ -327,6 +331,14 @@ class Folder(_Closable):
             if moment is not None:
                 yield moment
 
+    def _newest(self) -> str:
+        """Last name of a message in alphabetical order, without suffix; empty if there is none."""
+        try:
+            names = os.listdir(self._folder)
+        except OSError:  # The folder may be recreated.
+            return ""
+        return max((name[: -len(_MESSAGE)] for name in names if name.endswith(_MESSAGE)), default="")
+
     def _leave_out(self, error: StreamError) -> None:
         self._left_out += 1
         if self._left_out <= _NAMED:
@@ -334,7 +346,7 @@ class Folder(_Closable):
             _log.warning("A frame is skipped: %s%s", error, further)
 
     def _message(self, name: str) -> FrameMessage:
-        path = self._folder / f"{name}.json"
+        path = self._folder / f"{name}{_MESSAGE}"
         try:
             message = msgspec.json.decode(read_bytes(path, VALUES), type=FrameMessage)
         except (OSError, msgspec.MsgspecError, RecursionError) as error:

@@ -392,6 +392,24 @@ def test_a_growing_folder_is_followed(sequence: Sequence, assembler: Assembler, 
         Folder(assembler, ("left",), tmp_path / "002.json")
 
 
+def test_a_folder_that_takes_long_to_list_is_listed_less_often(
+    assembler: Assembler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, now, pauses = Folder(assembler, ("left",), tmp_path), [0.0], list[float]()
+
+    def clock() -> float:
+        now[0] += 0.5
+        return now[0]
+
+    def wait(seconds: float) -> bool:
+        pauses.append(seconds)
+        return len(pauses) == 3
+
+    monkeypatch.setattr("carts_core.live.sources.time", SimpleNamespace(monotonic=clock))
+    monkeypatch.setattr(source, "_closed", SimpleNamespace(wait=wait))
+    assert list(source) == [] and pauses == [0.01, 0.5, 0.5]
+
+
 def test_what_cannot_be_used_in_a_folder_is_left_out(
     sequence: Sequence, assembler: Assembler, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
