@@ -70,12 +70,12 @@ class Limits:
     """Maximum size of a temporary file [bytes]."""
 
     @staticmethod
-    def of(path: Path) -> "Limits":
-        """Limits for a file or folder, in proportion to its size."""
+    def of(path: Path, *, seconds_per_mib: float = _SECONDS_PER_MIB) -> "Limits":
+        """Limits for a file or folder, in proportion to its size; `seconds_per_mib` of processor time [s/MiB]."""
         files = [path] if not path.is_dir() else path.iterdir()
         size = sum(file.stat().st_size for file in files if file.is_file())
         return Limits(
-            _SECONDS + _SECONDS_PER_MIB * size / MIB,
+            _SECONDS + seconds_per_mib * size / MIB,
             _MEMORY + _MEMORY_PER_BYTE * min(size, _COUNTED),
             _MAX_FILE_BYTES + 100 * size,
         )

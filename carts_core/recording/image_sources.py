@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 
 from ..decoders import bags
 from ..errors import SequenceError
-from ..files.decoding import Limits, acquire, release
+from ..files.decoding import DecodingLimitError, Limits, acquire, release
 from ..package_imports import require_package
 from .images import ImageSource, decode_image
 
@@ -78,6 +78,10 @@ class Cropped:
         return Cropped(self.source.select(kept), self.crop)
 
 
+_SECONDS_PER_MIB = 1.0
+"""Processor time for decoding a bag [s/MiB], several times that of a bag of joint states only."""
+
+
 class Bag:
     """Open ROS bag, read in a child process, one call at a time; a context manager.
 
@@ -91,7 +95,7 @@ class Bag:
             raise SequenceError(f"bag {path} is missing. Restore it, or correct the path.")
         self.path = path
         self._lock = threading.Lock()
-        self._decoder, self._limits = acquire(), Limits.of(path)
+        self._decoder, self._limits = acquire(), Limits.of(path, seconds_per_mib=_SECONDS_PER_MIB)
         self.close = weakref.finalize(self, release, self._decoder)
         self.topics: list[tuple[str, str]] = [(name, kind) for name, kind in self._call(bags.topics)]
 
@@ -119,6 +123,11 @@ class Bag:
         try:
             with self._lock:
                 return self._decoder.call(function, self.path, *arguments, limits=self._limits)
+        except DecodingLimitError as error:
+            raise SequenceError(
+                f"bag {self.path} was not read: {error}, the limit for a bag of this size. If you trust its origin, "
+                "decompress or split it (rosbag decompress, ros2 bag convert), or read it on a faster computer."
+            ) from error
         except (OSError, ValueError) as error:
             if self.path.is_file() and (self.path.parent / "metadata.yaml").is_file():
                 folder = self.path.parent

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recordings
+from fuzz.growing_files import MCAP
 from fuzz.mutations import mutated_bytes, mutated_text
 from recordings import BagKind, write_bag
 from scipy.io import savemat
@@ -24,7 +25,7 @@ from test_surgsync import clip, episode
 
 from carts_core.decoders.tables import read_matlab
 from carts_core.errors import CartsError, SequenceError
-from carts_core.files.decoding import decoded
+from carts_core.files.decoding import Limits, decoded
 from carts_core.recording import Sequence
 from carts_core.recording.image_sources import Bag
 from carts_core.recording.importing.importer import import_recording
@@ -172,6 +173,19 @@ def test_a_bag_on_its_own_is_checked_too(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x.bag")
     with pytest.raises(SequenceError, match="not a regular file"):
         Bag(tmp_path / "x.bag")
+
+
+def test_a_bag_beyond_its_limits_is_not_called_damaged(tmp_path: Path) -> None:
+    grown = MCAP["zstd"](tmp_path)
+    with pytest.raises(SequenceError, match=r"needs more than 320 MiB of memory, the limit for .* split it") as refused:
+        Bag(grown)
+    assert "damaged" not in str(refused.value)
+
+
+def test_a_bag_may_take_a_second_for_each_mebibyte(bag: Path) -> None:
+    with Bag(bag) as reader:
+        size = sum(file.stat().st_size for file in bag.iterdir())
+        assert reader._limits.seconds == pytest.approx(Limits().seconds + size / 2**20)
 
 
 def test_a_damaged_matlab_file_is_refused(tmp_path: Path) -> None:
