@@ -91,6 +91,8 @@ def change(before: Picture, now: Picture) -> float:
     return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())
 
 
+_BAD_FITS = 2
+"""Minimum number of consecutive bad fits after which the arms are lost [1]."""
 _STARTED_AGAIN = 1.0
 """Decrease of timestamps above which tracking starts over [s]."""
 _REMEMBERED = 60
@@ -232,6 +234,8 @@ class LiveTracker:
         """State of the error model after the last good frame."""
         self._seen = -math.inf
         """Timestamp of the last good frame [s]."""
+        self._bad_fits = 0
+        """Number of consecutive bad fits up to the last frame."""
         self._pose: list[np.ndarray] = []
         """Joint positions of each arm in the last good frame [rad, m]."""
         self._sees = True
@@ -280,7 +284,7 @@ class LiveTracker:
         attempt, measurement = self._measured(frame, variables, errors, now, found_again=recovered is not None)
         self._loss = measurement.loss
         if self._fits(attempt, measurement):
-            state = self._take(errors, attempt, measurement)
+            state, self._bad_fits = self._take(errors, attempt, measurement), 0
             if self._look is not None and self._look.attempt.time < now:
                 self._look.later.append((now, measurement))
             self.verdict = LiveVerdict.GOOD
@@ -288,8 +292,9 @@ class LiveTracker:
             if self._arm_is_elsewhere(frame, variables, correction.mean, measurement.loss, now):
                 self.verdict = LiveVerdict.DOUBTFUL
         else:
-            gone = self._filtered is None or now - self._seen > self.live.lost_seconds
-            self.verdict = LiveVerdict.LOST if gone else LiveVerdict.DOUBTFUL
+            self._bad_fits += 1
+            gone = now - self._seen > self.live.lost_seconds and self._bad_fits >= _BAD_FITS
+            self.verdict = LiveVerdict.LOST if gone or self._filtered is None else LiveVerdict.DOUBTFUL
             correction, measurement = self._known(errors, now).expected, measurement.left_out()
         prior = errors.correction(errors.initial())
         visit = Visit(frame.frame_id, variables, measurement, Origin.WARM, 0.0)

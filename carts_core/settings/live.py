@@ -92,7 +92,7 @@ class LiveSettings(Ranged):
     bad_factor: Annotated[float, Range(1, 100)] = 2.5
     """Multiple of the usual loss above which a fit is also bad [1]; this bound is at least half of `bad_loss`."""
     lost_seconds: Seconds = 0.25
-    """Duration of bad fits after which the arms are lost [s]."""
+    """Duration of at least two consecutive bad fits after which the arms are lost [s]."""
     search_seconds: Seconds = 0.4
     """Interval between searches for lost arms while images show them; frames in between are compared with the last
     known pose [s]. The first image that shows them again is searched at once."""

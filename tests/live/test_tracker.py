@@ -144,6 +144,17 @@ def test_a_hidden_arm_is_lost_and_found_again_where_it_was(stream: Stream) -> No
     assert verdict is LiveVerdict.GOOD and effort is Effort.SMALL and error < 0.3
 
 
+def test_at_a_low_frame_rate_one_bad_frame_is_doubtful_and_the_next_one_lost(stream: Stream) -> None:
+    assert {stream.next(0.5)[0] for _ in range(3)} == {LiveVerdict.GOOD}
+    for _ in range(2):
+        stream.predictor.hidden = True
+        assert stream.next(0.5)[0] is LiveVerdict.DOUBTFUL
+        stream.predictor.hidden = False
+        assert stream.next(0.5)[0] is LiveVerdict.GOOD
+    stream.predictor.hidden = True
+    assert [stream.next(0.5)[0] for _ in range(2)] == [LiveVerdict.DOUBTFUL, LiveVerdict.LOST]
+
+
 def test_after_an_error_that_jumps_the_arm_is_found_within_a_second(stream: Stream) -> None:
     for _ in range(3):
         stream.next()
