@@ -41,16 +41,23 @@ _SILENCE = 10.0
 """Idle time after which a client may be disconnected in favour of a new client if the maximum number of connections is
 reached [s]."""
 _LINGER = 1.0
-"""Time for which a client receives results after closing its side of the connection [s]."""
+"""Minimum time for which a client that sends receives results after closing its side of the connection [s]."""
+_LONGEST_LINGER = 30.0
+"""Maximum further time until the result of its last frame [s], which never comes if the frame was dropped."""
 
 
 class _Client:
-    """Client: queue of outgoing messages, and time of the last received message [s]."""
+    """Client: queue of outgoing messages, time of the last received message [s], and last frame."""
 
     def __init__(self) -> None:
         self.waiting: queue.Queue[bytes | None] = queue.Queue(_WAITING)
         self.heard = time.monotonic()
         self.sends = False
+        self.last: tuple[str, float | None] | None = None
+        """Id and timestamp of the client's last frame."""
+        self.answered = threading.Event()
+        """Set unless the result of the last frame is missing."""
+        self.answered.set()
 
 
 class StreamServer:
@@ -92,6 +99,8 @@ class StreamServer:
         with self._changing:
             for client in self._clients.values():
                 _put_newest(client.waiting, content)
+                if client.last == (result.id, result.time):
+                    client.answered.set()
 
     def close(self) -> None:
         """See `Source`."""
@@ -102,6 +111,7 @@ class StreamServer:
         with self._changing:
             for client in self._clients.values():
                 _put_newest(client.waiting, None)
+                client.answered.set()
         _put_newest(self._moments, None)
         # Clients that do not read their results would stay connected.
         timer = threading.Timer(_LINGER, self._disconnect)
@@ -153,9 +163,12 @@ class StreamServer:
                 client.heard, client.sends = time.monotonic(), True
                 moment = self._assembler.moment(message, client.heard)
                 if moment is not None:
+                    with self._changing:
+                        client.last = moment.frame.frame_id, moment.frame.timestamp
+                        client.answered.clear()
                     _put_newest(self._moments, moment)
-            if client.sends:
-                self._closed.wait(_LINGER)
+            if client.sends and not self._closed.wait(_LINGER):
+                client.answered.wait(_LONGEST_LINGER)
         except StreamError as error:
             _put_newest(client.waiting, packed(ErrorMessage(str(error))))
         except OSError:
@@ -168,6 +181,7 @@ class StreamServer:
                 connection.sendall(content)
         with self._changing:
             self._clients.pop(connection, None)
+            client.answered.set()
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
         connection.close()

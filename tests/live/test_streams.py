@@ -355,6 +355,29 @@ def test_a_half_closed_sender_gets_its_last_result(assembler: Assembler, monkeyp
         server.close()
 
 
+@pytest.mark.parametrize("stops", [False, True])
+def test_a_half_closed_sender_gets_a_late_result_unless_the_server_stops(
+    sequence: Sequence, assembler: Assembler, monkeypatch: pytest.MonkeyPatch, stops: bool
+) -> None:
+    monkeypatch.setattr("carts_core.live.sources._LINGER", 0.0)
+    server = StreamServer(assembler, 0)
+    try:
+        with connected(server) as sender:
+            sender.sendall(packed(FrameMessage(0.5, JOINTS, {"left": picture(sequence)}, id="late")))
+            sender.shutdown(socket.SHUT_WR)
+            assert next(iter(server)).frame.frame_id == "late"
+            assert not select.select([sender], [], [], 1.0)[0], "the connection is open"
+            if not stops:
+                server.send(RESULT)
+                server.send(msgspec.structs.replace(RESULT, id="late", time=0.5))
+                answers = list(_answers(sender))
+                assert [answer.id for answer in answers if isinstance(answer, ResultMessage)] == ["a", "late"]
+            server.close()
+            assert list(_answers(sender)) == []
+    finally:
+        server.close()
+
+
 def test_a_broken_connection_ends_without_an_error_for_others(assembler: Assembler) -> None:
     one, other = socket.socketpair()
     other.sendall(struct.pack(">I", 10) + b"abc")
