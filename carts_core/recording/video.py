@@ -19,7 +19,7 @@ import av
 import av.filter
 import numpy as np
 from av.container import InputContainer
-from av.error import FFmpegError
+from av.error import ExitError, FFmpegError
 from av.index import IndexEntry
 from av.sidedata.sidedata import SideData
 from av.video.frame import VideoFrame
@@ -45,8 +45,8 @@ _OPTIONS = {
     "max_streams": "32",
 }
 """Options of FFmpeg: video containers only, since playlists would open other files."""
-_SECONDS = 10.0
-"""Timeout for opening and reading [s]."""
+_SECONDS = 60.0
+"""Timeout for opening, and for each read [s]; disks of a network server may need half a minute to start."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class VideoIndex:
 
 
 def index_video(path: Path) -> VideoIndex:
-    """Create the index of a video file; cached until the file changes."""
+    """Create the index of a video file; cached until the file changes, unless reading it fails."""
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
@@ -80,7 +80,10 @@ def index_video(path: Path) -> VideoIndex:
         check_regular(path, VIDEO)
     except OSError as error:
         raise SequenceError(f"video {path} cannot be read: {error}.") from error
-    return _index(path.resolve(), status.st_mtime_ns, status.st_size)
+    try:
+        return _index(path.resolve(), status.st_mtime_ns, status.st_size)
+    except ExitError as error:
+        raise _stalled(path) from error
 
 
 def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, VideoStream]:
@@ -94,6 +97,8 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
     options = _OPTIONS if parsed else {**_OPTIONS, "fflags": "+noparse"}
     try:
         container = av.open(str(path.absolute()), container_options=options, timeout=_SECONDS)
+    except ExitError as error:
+        raise _stalled(path) from error
     except (FFmpegError, OSError, ValueError) as error:
         raise SequenceError(f"video {path} cannot be decoded ({error}). {_remedy(path)}") from error
     stream = container.streams.best("video")
@@ -110,11 +115,14 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
 
 
 def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Decode frames from the current position on; damaged frames are skipped."""
+    """Decode frames from the current position on; damaged frames are skipped. `ExitError` if reading takes longer than
+    the timeout."""
     packets = container.demux(stream)
     while True:
         try:
             packet = next(packets)
+        except ExitError:
+            raise
         except (StopIteration, FFmpegError):
             return
         try:
@@ -166,6 +174,8 @@ def _as_in_table(
             (packet.pts, packet.dts, packet.pos, packet.size, packet.is_keyframe)
             for packet in islice(packets, len(entries) + to_end)
         ]
+    except ExitError:
+        raise
     except FFmpegError:
         return False
     return found == [(entry.timestamp, entry.timestamp, entry.pos, entry.size, entry.is_keyframe) for entry in entries]
@@ -188,6 +198,8 @@ def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
                 shown.append(packet.pts)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.dts))
+        except ExitError:
+            raise
         except FFmpegError:
             pass  # The file is truncated here; earlier frames are intact.
         time_base = stream.time_base
@@ -212,6 +224,13 @@ def _by_decoding(path: Path) -> VideoIndex:
     pts = tuple(time for time in times if time is not None)
     increasing = len(pts) == len(times) and all(a < b for a, b in pairwise(pts))
     return VideoIndex(len(times), pts if increasing else None, time_base, ())
+
+
+def _stalled(path: Path) -> SequenceError:
+    return SequenceError(
+        f"video {path} cannot be read: the disk or network did not answer within {_SECONDS:.0f} s. Check them, and try "
+        "again."
+    )
 
 
 def _remedy(path: Path) -> str:
@@ -312,7 +331,12 @@ class Video:
         return tuple(found)
 
     def _frame(self, number: int) -> VideoFrame:
-        frame = self._kept.find(number) or self._decode(number)
+        try:
+            frame = self._kept.find(number) or self._decode(number)
+        except ExitError as error:
+            # The container remembers the error.
+            self._close()
+            raise _stalled(self.path) from error
         if frame is None or frame.is_corrupt:
             raise SequenceError(
                 f"video {self.path} ends or is damaged at frame number {number} (counted from 0). Copy it again, or "
@@ -326,6 +350,11 @@ class Video:
         other._lock, other._kept = threading.Lock(), ByteCache(_KEPT_BYTES // 4, _frame_bytes)
         other._open, other._frames, other._last = None, iter(()), None
         return other
+
+    def _close(self) -> None:
+        if self._open is not None:
+            self._open[0].close()
+        self._open, self._frames, self._last = None, iter(()), None
 
     def _decode(self, number: int) -> VideoFrame | None:
         """Decode up to frame `number`; None if decoding fails."""
@@ -354,14 +383,15 @@ class Video:
         """Seek so that frame `key` or an earlier frame is decoded next; False on failure."""
         self._last = None
         if self._open is None or seek_to is None:
-            if self._open is not None:
-                self._open[0].close()
+            self._close()
             self._open = open_video(self.path)
         container, stream = self._open
         self._bottom_first = stream.codec_context.field_order in _BOTTOM_FIRST
         try:
             if seek_to is not None:
                 container.seek(seek_to, stream=stream)
+        except ExitError:
+            raise
         except FFmpegError:
             return False
         frames = self._numbered(decoded_frames(container, stream))

@@ -1,11 +1,13 @@
 """Video: the frame that is asked for is the frame that comes, in any order."""
 
+from itertools import islice
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
 import pytest
+from av.error import ExitError
 from videos import write_video
 
 from carts_core.errors import SequenceError
@@ -255,6 +257,56 @@ def test_what_is_no_video_is_refused(tmp_path, content, message):
         (tmp_path / "left.mp4").write_bytes(content)
     with pytest.raises(SequenceError, match=rf"left.mp4 {message}"):
         Video(tmp_path / "left.mp4", (0,))
+
+
+STALLED = r"left.mkv cannot be read: the disk or network did not answer within .* try again"
+
+
+def test_a_disk_that_does_not_answer_while_opening_is_named(tmp_path, monkeypatch):
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "10"})
+    with monkeypatch.context() as patch:
+        patch.setattr("carts_core.recording.video._SECONDS", 1e-9)
+        with pytest.raises(SequenceError, match=STALLED):
+            index_video(path)
+    assert index_video(path).count == FRAMES
+
+
+def test_a_disk_that_stops_answering_does_not_shorten_the_video(tmp_path, monkeypatch):
+    path = write_numbered(tmp_path / "left.mkv", "libx264", {"g": "30", "bf": "0", "sc_threshold": "0"})
+
+    class Stalling:
+        """A container whose reading takes too long after some packets."""
+
+        def __init__(self, container) -> None:
+            self.container = container
+
+        def demux(self, stream):
+            yield from islice(self.container.demux(stream), 15)
+            raise ExitError(-1, "Immediate exit requested")
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.container.close()
+
+        def __getattr__(self, name: str):
+            return getattr(self.container, name)
+
+    def stalling(path: Path, *, parsed: bool = True):
+        container, stream = open_video(path, parsed=parsed)
+        return Stalling(container), stream
+
+    with monkeypatch.context() as patch:
+        patch.setattr("carts_core.recording.video.open_video", stalling)
+        with pytest.raises(SequenceError, match=STALLED):
+            index_video(path)
+    video = Video(path, tuple(range(FRAMES)))
+    with monkeypatch.context() as patch:
+        patch.setattr("carts_core.recording.video.open_video", stalling)
+        with pytest.raises(SequenceError, match=STALLED):
+            video.read(25)
+    assert [number_of(video.read(index)) for index in (25, 3, 59)] == [25, 3, 59]
 
 
 @pytest.mark.parametrize("value", ["1.5", "-1"])
