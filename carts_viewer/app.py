@@ -213,7 +213,7 @@ class ViewerApp:
         self.page.project = sequence.name
         self._thumbnails = Thumbnails(sequence, self._saved_pose)
         self.page.thumbnail = self._thumbnails.answer
-        self._worker = Worker(queue, self.tabs, lambda: self._solver.busy)
+        self._worker = Worker(queue, self.tabs, lambda: self._solver.busy, report)
         self._listener = _SolverListener(self._worker, self._say)
         self._solver.listeners.append(self._listener)
         EventDispatcher(self.page, self.tabs, self._worker, sequence)

@@ -1,5 +1,6 @@
 """Tabs: the queue of intents, the state and view of each tab, and the state that all tabs share."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -28,6 +29,8 @@ from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
 from carts_viewer.transport.events import Hello
+
+_log = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=Hashable)
 
@@ -318,12 +321,15 @@ class Tabs:
 
         Raises:
             CartsError: some work could not be saved; all other work is saved.
+            Exception: likewise, after an unexpected error, which is logged.
         """
-        problems = []
+        problems: list[Exception] = []
         for close in (self.job_runner.close, self._session.close, *(tab.close for tab in self._tabs)):
             try:
                 close()
-            except CartsError as error:
+            except Exception as error:
+                if not isinstance(error, CartsError):
+                    _log.error("Unexpected error while unfinished work was saved", exc_info=error)
                 problems.append(error)
         if problems:
             raise problems[0]

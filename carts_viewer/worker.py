@@ -18,6 +18,8 @@ MEMORY_KEPT = 10.0
 """Idle time after which freed memory is returned to the operating system [s]."""
 MEMORY_KEPT_AT_WORK = 30.0
 """Interval between returns of memory during work with an open page [s]; each may delay a picture by milliseconds."""
+_NOTICE = 5.0
+"""Interval between messages while the end of the thread is awaited [s]."""
 _STARTS_LONG_WORK = (intents.Optimizing, intents.SequenceIntent, intents.Exporting, intents.Jobs)
 """Classes of intents that may start long work."""
 
@@ -28,9 +30,21 @@ class Worker:
     Tabs take turns: work of one tab delays the others by a single step.
     """
 
-    def __init__(self, queue: IntentQueue[Tab], tabs: Tabs, computing: Callable[[], bool] = lambda: False) -> None:
-        """`computing`: returns whether the solver is busy; texts about its preparation are then kept."""
-        self._queue, self._computing = queue, computing
+    def __init__(
+        self,
+        queue: IntentQueue[Tab],
+        tabs: Tabs,
+        computing: Callable[[], bool] = lambda: False,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        """
+        Args:
+            queue: intents of the tabs.
+            tabs: the tabs.
+            computing: returns whether the solver is busy; texts about its preparation are then kept.
+            say: called with a line for the user while `stop` waits.
+        """
+        self._queue, self._computing, self._say = queue, computing, say
         self._tabs = tabs
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._stop = threading.Event()
@@ -49,10 +63,14 @@ class Worker:
         self._thread.start()
 
     def stop(self) -> None:
-        """Finish the current work and end the thread."""
+        """Finish the current work and end the thread, however long the work takes."""
         self._stop.set()
         self._queue.wake()
-        self._thread.join(timeout=30.0)
+        while True:
+            self._thread.join(_NOTICE)
+            if not self._thread.is_alive():
+                return
+            self._say("Waiting for the current step to end")
 
     def wake(self) -> None:
         """Continue with work that waits for a reply of the solver. Thread-safe."""

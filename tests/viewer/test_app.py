@@ -235,6 +235,48 @@ def test_closing_ends_runs_and_reading_in_advance_and_saves_the_gesture_under_wa
     running.close()
 
 
+def test_closing_waits_for_the_worker_and_says_so(open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    app, lines, goes_on = open_viewer(), list[str](), threading.Event()
+    monkeypatch.setattr(worker, "_NOTICE", 0.05)
+    monkeypatch.setattr(app._worker, "_say", lines.append)
+
+    def block() -> None:
+        goes_on.wait(60)
+
+    app._worker.call(block)
+    app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
+    closing = threading.Thread(target=app.close)
+    closing.start()
+    eventually(lambda: len(lines) > 2)
+    assert set(lines) == {"Waiting for the current step to end"} and closing.is_alive()
+    goes_on.set()
+    closing.join()
+    with Project.open(app.sequence, app.project.path) as project:
+        assert project.state.joints(0)["PSM1"].joint_positions[0] == pytest.approx(0.1)
+
+
+def test_after_an_unexpected_error_at_the_end_the_drafts_of_other_tabs_are_saved(
+    open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(editing, "MAX_DRAFT_SECONDS", 1e6)
+    app = open_viewer()
+
+    def broken() -> None:
+        raise RuntimeError("generator already executing")
+
+    with RawTab(app.url) as first, RawTab(app.url) as second:
+        places = [place_of(app, tab) for tab in (first, second)]
+        assert list(app.tabs) == places
+        places[1].put(intents.SetJoint("PSM1", 0, 0.1))
+        app.wait_until_shown()
+        monkeypatch.setattr(places[0].controller, "close", broken)
+        with pytest.raises(RuntimeError, match="already executing"):
+            app.close()
+    with Project.open(app.sequence, app.project.path) as project:
+        assert project.state.joints(0)["PSM1"].joint_positions[0] == pytest.approx(0.1)
+    assert "Unexpected error while unfinished work was saved" in caplog.text
+
+
 def test_a_second_viewer_of_the_same_project_has_another_port_saves_nothing_and_says_so(
     open_viewer: OpenViewer,
 ) -> None:
