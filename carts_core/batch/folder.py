@@ -9,7 +9,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Rows
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -140,7 +140,8 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
 
         def beat() -> None:
             while not ended.wait(HEARTBEAT_SECONDS):
-                job.change()
+                with suppress(OutputError):  # The disk may be full for a moment.
+                    job.change()
 
         thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
         thread.start()

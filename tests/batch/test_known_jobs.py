@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 import pytest
+from processes import eventually
 
+from carts_core.batch import folder as batch_folder
 from carts_core.batch.cost import Cost, JobCost
 from carts_core.batch.folder import (
     FINDINGS_FILE,
@@ -23,11 +26,13 @@ from carts_core.batch.folder import (
     JobState,
     StepState,
     known_jobs,
+    read_state,
     write_jobs,
     write_state,
 )
 from carts_core.batch.manifest import Job
 from carts_core.batch.report import write_batch_report
+from carts_core.errors import OutputError
 from carts_core.files import OutputPath, output_path, resolved_paths, write_text
 from carts_viewer.start.batch_page import BatchPage
 
@@ -133,6 +138,25 @@ def test_jobs_of_another_computer_are_lost_without_a_recent_heartbeat(tmp_path: 
     )
     batch, jobs, _ = archive(tmp_path, [], silent=silent, beating=beating, here=here)
     assert [entry.status for entry in known_jobs(batch, jobs)] == ["lost", "running", "lost"]
+
+
+def test_the_heartbeat_goes_on_after_a_failed_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = list[OutputPath]()
+
+    def full(folder: OutputPath, state: JobState) -> None:
+        if threading.current_thread().name == "heartbeat" and not failed:
+            failed.append(folder)
+            raise OutputError(f"{folder} cannot be written (No space left on device).")
+        write_state(folder, state)
+
+    monkeypatch.setattr(batch_folder, "write_state", full)
+    monkeypatch.setattr(batch_folder, "HEARTBEAT_SECONDS", 0.01)
+    folder = output_path(tmp_path / "job")
+    with batch_folder.running(folder) as job:
+        assert job is not None
+        eventually(lambda: bool(failed))
+        before = read_state(folder).heartbeat
+        eventually(lambda: read_state(folder).heartbeat > before)
 
 
 def test_links_in_the_folder_of_jobs_are_not_followed(tmp_path: Path) -> None:
