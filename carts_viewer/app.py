@@ -100,7 +100,7 @@ class EventDispatcher:
                 self._paint(client_id, tab, event)
             case intents.Intent():
                 if isinstance(event, intents.Drawn):
-                    view.display.drawn()
+                    view.display.drawn(event.picture)
                 tab.put(event)
 
     def _attach(self, client_id: int, hello: events.Hello) -> None:

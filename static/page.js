@@ -402,7 +402,7 @@
     }, { capture: true });
   }
 
-  // ---- Reports to the server: drawn overlays, and the end of drags -------------------------------------------------
+  // ---- Reports to the server: drawn pictures, and the end of drags -------------------------------------------------
 
   const tab = Math.random().toString(36).slice(2);
   let reports = 0;
@@ -454,15 +454,27 @@
   }, { capture: true });
   window.addEventListener("focusout", (event) => { if (isControl(event)) { grabbed = true; letGo(); } });
   let drawnTexture = null;
+  let expected = null; // picture that is being drawn: its number, and the textures that it replaces, by node
 
-  /** Acknowledge a drawn overlay. The server waits for this, since WebGL drops a texture that is replaced while decoded. */
-  function reportDrawn() {
+  function textureOf(node) {
     let texture = null;
-    viser()?.nodeRefFromName[OVERLAY]?.traverse((child) => { texture ??= child.material?.map ?? null; });
-    if (texture && texture.uuid !== drawnTexture) {
-      drawnTexture = texture.uuid;
-      report("Drawn");
-    }
+    viser()?.nodeRefFromName[node]?.traverse((child) => { texture ??= child.material?.map ?? null; });
+    return texture?.uuid ?? null;
+  }
+
+  /** Receive the number of the newest picture, and the nodes whose images have changed, before they are loaded. */
+  function expectPicture(number, nodes) {
+    const changed = Object.fromEntries(nodes.map((node) => [node, textureOf(node)]));
+    expected = { number, replaced: { ...expected?.replaced, ...changed } };
+  }
+
+  /** Acknowledge a drawn picture. The server waits for this, since an image that is replaced while it is loaded is never drawn. */
+  function reportDrawn() {
+    drawnTexture = textureOf(OVERLAY) ?? drawnTexture;
+    const loaded = ([node, before]) => ![before, null].includes(textureOf(node));
+    if (!expected || !Object.entries(expected.replaced).every(loaded)) return;
+    report("Drawn", { picture: expected.number });
+    expected = null;
   }
 
   // ---- Return the keyboard to the page after a list, a box or a button was used with the pointer ------------------------
@@ -538,7 +550,7 @@
   })();
 
   window.carts = {
-    view, imageAt, activate, connected,
+    view, imageAt, activate, connected, expectPicture,
     shown: () => shown,
     /** Receive the state of cameras, frame and marks from the server, and pass it to the other scripts. */
     setPage(message) {

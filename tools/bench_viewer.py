@@ -56,7 +56,7 @@ def slider_latency(
         app: The viewer.
         drags: Number of drags.
         seconds: Duration of each [s].
-        draws: Whether the tab acknowledges overlays; otherwise the viewer waits for its timeout.
+        draws: Whether the tab acknowledges pictures; otherwise the viewer waits for its timeout.
         job: Whether all frames are optimized at the same time.
     """
     arm = app.state.frame.measured

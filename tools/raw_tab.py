@@ -51,7 +51,7 @@ class RawTab:
         """
         Args:
             url: The page's address.
-            draws: Whether the tab acknowledges overlays.
+            draws: Whether the tab acknowledges pictures.
             keep: Number of overlays that are kept; None for all.
             origin: Value of the header `Origin`; None to omit it, as programs do.
             hello: Whether the tab sends `Hello`, as the page does, and waits for the answer.
@@ -194,6 +194,9 @@ class RawTab:
                 self._saying = asyncio.create_task(self._say_hello())
         if message["type"] == "RunJavascriptMessage" and '"setPage"' in message["source"]:
             self._joined.set()
+        if self._draws and message["type"] == "RunJavascriptMessage" and '"expectPicture"' in message["source"]:
+            picture = json.loads(message["source"])["args"][0]
+            await self._push(msgspec.msgpack.encode(self._report("Drawn", picture=picture)))
         if props.get("label") == "channel":
             self._channel = message["uuid"]
         if message["type"] == "GuiUpdateMessage" and "value" in updates:
@@ -203,8 +206,6 @@ class RawTab:
             self.widgets.setdefault(message["uuid"], {}).update({**known, **props, **updates})
         if message.get("name") == OVERLAY and "_data" in (updates or props):
             self.overlays.append((arrived, (updates or props)["_data"]))
-            if self._draws:
-                await self._push(msgspec.msgpack.encode(self._report("Drawn")))
 
     def _report(self, kind: str, **values: Any) -> dict[str, Any]:
         """The message of an event."""

@@ -41,7 +41,10 @@ class Refresh(Latest):
 
 
 class Drawn(Latest):
-    """Report that a tab has drawn the newest overlay, so that the worker may send the next one."""
+    """Report that a tab has drawn a picture, so that the worker may send the next one."""
+
+    picture: int
+    """Number of the picture."""
 
 
 class Released(Latest):

@@ -11,7 +11,7 @@ from carts_viewer.panels.inputs import Panel
 from carts_viewer.picture.comparison import compared_poses, composed, outlines, painted
 from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts, transparent
 from carts_viewer.picture.overlay import OverlayRenderer, with_imported
-from carts_viewer.picture.scene_view import SceneView
+from carts_viewer.picture.scene_view import FRAME, OVERLAY, SceneView
 from carts_viewer.session import Session
 from carts_viewer.state import ComparedPose, CompareMode, ViewState
 from carts_viewer.transport.page import TabPage
@@ -51,9 +51,9 @@ class PageDisplay:
         self._rate_limit = RateLimit()
         self._shown: ViewState | None = None
 
-    def drawn(self) -> None:
-        """Record that the tab has drawn the newest picture. Thread-safe."""
-        self._rate_limit.drawn()
+    def drawn(self, number: int) -> None:
+        """Record that the tab has drawn the picture with this number. Thread-safe."""
+        self._rate_limit.drawn(number)
 
     def ready_in(self) -> float:
         """Time until the page can receive another picture [s]."""
@@ -68,15 +68,18 @@ class PageDisplay:
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
             overlays = self._overlays(state, self._shown_cameras(state))
             # Before sending, since a tab may acknowledge the picture before `flush` is called.
-            self._rate_limit.sent()
+            number = self._rate_limit.sent()
             # Sent together, so that a new frame never appears under the old frame's overlay.
             with self._page.atomic():
                 if old is None or (state.index, state.camera) != (old.index, old.camera):
                     self._page.call("setPicture", state.index, state.camera, camera.width, camera.height)
-                if new_frame:
-                    self._scene_view.show_frame(state.frame.images[state.camera], camera)
-                self._scene_view.show_overlay(overlays[state.camera], camera)
+                changed = []
+                if new_frame and self._scene_view.show_frame(state.frame.images[state.camera], camera):
+                    changed.append(FRAME)
+                if self._scene_view.show_overlay(overlays[state.camera], camera):
+                    changed.append(OVERLAY)
                 self._show_others(state, old, overlays)
+                self._page.call("expectPicture", number, changed)
             self._page.flush()
             self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
             if self._scene_shown or old is None:
@@ -202,25 +205,36 @@ def _draw_paint(
         paint_over(overlay, correction, ignored, max(state.opacity, 0.4) if at_work else state.opacity)
 
 
-MAX_WAIT = 0.08
-"""Time after which the next picture is sent without an acknowledgement [s]."""
+FIRST_WAIT = 0.08
+"""Time after which the next picture is sent if the last one is not acknowledged [s]."""
+LONGEST_WAIT = 2.0
+"""The same time after several pictures that were not acknowledged [s]."""
 
 
 class RateLimit:
-    """Decides when the next picture may be sent: once the tab has drawn the last picture, or after `MAX_WAIT`."""
+    """Decides when the next picture may be sent: once the tab has drawn the last picture, or after a wait.
+
+    The wait doubles with each unacknowledged picture, since a slow tab needs longer to draw one, and a slow connection
+    longer to transmit it.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._sent_at = self._drawn_at = float("-inf")
+        self._sent_at, self._wait = float("-inf"), FIRST_WAIT
+        self._sent = self._drawn = 0
+        """Numbers of the last sent picture, and of the last acknowledged one."""
 
-    def sent(self) -> None:
-        """Record that a picture was sent."""
+    def sent(self) -> int:
+        """Record that a picture is sent; returns its number."""
+        self._wait = FIRST_WAIT if self._drawn == self._sent else min(2.0 * self._wait, LONGEST_WAIT)
         self._sent_at = self._clock()
+        self._sent += 1
+        return self._sent
 
-    def drawn(self) -> None:
-        """Record that the tab has drawn the newest picture. Thread-safe."""
-        self._drawn_at = self._clock()
+    def drawn(self, number: int) -> None:
+        """Record that the tab has drawn the picture with this number. Thread-safe."""
+        self._drawn = number
 
     def ready_in(self) -> float:
         """Time until the next picture may be sent [s]."""
-        return max(0.0, self._sent_at + MAX_WAIT - self._clock()) if self._drawn_at < self._sent_at else 0.0
+        return 0.0 if self._drawn == self._sent else max(0.0, self._sent_at + self._wait - self._clock())

@@ -63,13 +63,19 @@ class SceneView:
         self._add_cameras()
         self._add_grid()
 
-    def show_frame(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera) -> None:
-        """Show an image of this camera on its image plane (the base of its frustum)."""
-        self._put(FRAME, image, camera, self._depth, "jpeg")
+    def show_frame(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera) -> bool:
+        """Show an image of this camera on its image plane (the base of its frustum).
 
-    def show_overlay(self, picture: Rgba, camera: Camera) -> None:
-        """Show an overlay of this camera's image, slightly nearer to the camera centre than the image."""
-        self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
+        Returns whether it was sent: viser does not send the same file again.
+        """
+        return self._put(FRAME, image, camera, self._depth, "jpeg")
+
+    def show_overlay(self, picture: Rgba, camera: Camera) -> bool:
+        """Show an overlay of this camera's image, slightly nearer to the camera centre than the image.
+
+        Returns whether it was sent, as `show_frame` does.
+        """
+        return self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
 
     def show_beside(self, camera: Camera, active: Camera, image: np.ndarray | None, overlay: Rgba | None) -> None:
         """Show another camera's image and overlay beside those of the active camera; None leaves them unchanged.
@@ -140,13 +146,19 @@ class SceneView:
         before, self._poses[name] = self._poses.get(name), pose
         return before == pose
 
-    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
-        """Show an image as a plane at depth z whose projection by the intrinsics is the image itself."""
+    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> bool:
+        """Show an image as a plane at depth z whose projection by the intrinsics is the image itself.
+
+        Returns whether it was sent.
+        """
         fx, fy, cx, cy = camera.intrinsics
         size = (camera.width / fx * z, camera.height / fy * z)
         position = ((camera.width / 2 - cx) / fx * z, (camera.height / 2 - cy) / fy * z, z)
-        if self._plane(name, image, (camera,), size, position, kind) and name == FRAME:
+        before = self.sent(name) if name in self._planes else None
+        new = self._plane(name, image, (camera,), size, position, kind)
+        if new and name == FRAME:
             self._outline(LENS, camera, _LENS_COLOR)
+        return new or self.sent(name) != before
 
     def _plane(
         self,

@@ -21,8 +21,9 @@ from carts_viewer.app import ViewerApp
 from carts_viewer.panels.timeline import THUMBNAIL_HEIGHT, Traces, frame_code
 from carts_viewer.panels.tools import ToolPalette
 from carts_viewer.picture import layers
-from carts_viewer.picture.display import MAX_WAIT, PageDisplay, RateLimit
+from carts_viewer.picture.display import FIRST_WAIT, LONGEST_WAIT, PageDisplay, RateLimit
 from carts_viewer.picture.strokes import Tool
+from tools.raw_tab import RawTab
 
 
 @pytest.fixture
@@ -83,13 +84,31 @@ def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -
     limit = RateLimit(lambda: now[0])
     assert limit.ready_in() == 0.0
     limit.sent()
-    assert limit.ready_in() == pytest.approx(MAX_WAIT)
-    now[0] += MAX_WAIT
+    assert limit.ready_in() == pytest.approx(FIRST_WAIT)
+    now[0] += FIRST_WAIT
     assert limit.ready_in() == 0.0
-    limit.sent()
+    number = limit.sent()
     now[0] += 0.02
-    limit.drawn()
+    limit.drawn(number)
     assert limit.ready_in() == 0.0
+
+
+def test_a_tab_that_draws_slowly_gets_fewer_pictures_until_it_has_drawn_the_last_one() -> None:
+    now = [100.0]
+    limit = RateLimit(lambda: now[0])
+    waits, number = [], 0
+    for _ in range(8):
+        number = limit.sent()
+        waits.append(limit.ready_in())
+        # The last picture is on its way for longer than the one before.
+        limit.drawn(number - 1)
+        assert limit.ready_in() == waits[-1]
+        now[0] += waits[-1]
+        assert limit.ready_in() == 0.0
+    assert waits == pytest.approx([FIRST_WAIT * 2**count for count in range(5)] + 3 * [LONGEST_WAIT])
+    limit.drawn(number)
+    limit.sent()
+    assert limit.ready_in() == pytest.approx(FIRST_WAIT)
 
 
 class Sent:
@@ -128,6 +147,20 @@ def test_the_frame_of_strokes_changes_with_the_picture_and_not_with_the_widgets(
     sent.log.clear()
     display.show_picture(desk.do(intents.SetOpacity(0.7)))
     assert "show_overlay" in sent.log and "setPicture" not in [each[0] for each in sent.log]
+
+
+def test_an_image_that_is_the_same_as_before_is_not_reported_as_sent(tiny_sequence: Callable[..., Path]) -> None:
+    """A tab waits for the images that were sent; viser does not send the same file again."""
+    with ViewerApp.open(tiny_sequence(cameras=("left", "right")), port=0) as app, RawTab(app.url):
+        app.wait_until_shown()
+        view, camera = app.view.scene, app.scene.camera("left")
+        overlay = layers.transparent(camera.height, camera.width)
+        assert view.show_overlay(overlay + 1, camera)
+        assert view.show_overlay(overlay, camera) and not view.show_overlay(overlay, camera)
+        frame = app.state.frame.images["left"]
+        assert view.show_frame(255 - frame, camera)
+        assert view.show_frame(frame, camera) and not view.show_frame(frame, camera)
+        assert view.show_frame(frame, app.scene.camera("right"))
 
 
 # ---- The timeline ---------------------------------------------------------------------------------------------------
