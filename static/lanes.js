@@ -5,6 +5,7 @@
 
   const KEPT = 800; // maximum number of cached pictures
   const AT_ONCE = 2;
+  const AGAIN = [4000, 8000, 16000]; // delays before a picture that failed to load is requested again [ms]
   const WAIT = 90; // delay before a curve is requested again during a zoom [ms]
   const COLOURS = ["#8b98a5", "#2dd4a7"]; // of measured and corrected values
 
@@ -12,6 +13,7 @@
 
   const pictures = new Map(); // address -> image, or null if there is none
   const loading = new Set();
+  const failures = new Map(); // address -> number of failed requests
   let waiting = [];
   let drawAgain = () => {};
 
@@ -27,10 +29,17 @@
         load();
       };
       loading.add(address);
-      image.onload = () => done(image);
-      image.onerror = () => done(null);
+      image.onload = () => { failures.delete(address); done(image); };
+      image.onerror = () => { done(null); tryAgain(address); };
       image.src = address;
     }
+  }
+
+  /** Forget a failed request after a while, a few times; the server may have been busy, or the connection interrupted. */
+  function tryAgain(address) {
+    const count = failures.get(address) ?? 0;
+    failures.set(address, count + 1);
+    if (count < AGAIN.length) setTimeout(() => { pictures.delete(address); drawAgain(); }, AGAIN[count]);
   }
 
   /** Draw thumbnails of visible frames, spaced so that they do not overlap. */
@@ -152,7 +161,7 @@
       choose(name) { chosen = name; localStorage.setItem("carts-curve", name); asked = ""; drawAgain(); },
       /** Invalidate the curve after a change of its values. */
       forget() { asked = ""; },
-      loaded: () => [...pictures.keys()],
+      loaded: () => [...pictures].filter(([, picture]) => picture).map(([address]) => address),
       idle: () => !loading.size && !waiting.length,
       curve: () => curve,
     },

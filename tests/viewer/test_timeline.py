@@ -75,6 +75,23 @@ def check_edges(tab: Tab) -> None:
         eventually(lambda before=before: box_of(strip)["width"], lambda now, before=before: now < before - 30)
 
 
+def test_a_thumbnail_that_failed_is_asked_for_again(open_viewer: OpenViewer, open_tab: OpenTab) -> None:
+    app = open_viewer(frames=4)
+    answer = app.page.thumbnail
+    assert answer is not None
+    asked: list[str] = []
+
+    def busy(path: str):
+        asked.append(path)
+        return answer(path if asked.count(path) > 1 else "none")
+
+    app.page.thumbnail = busy
+    page = open_tab(app, (1280, 800)).page
+    wait_in(page, "carts.lanes.loaded().length == 4")
+    wait_in(page, "carts.lanes.idle()")
+    assert sorted(asked) == sorted(2 * [f"0/0/{frame}.jpg" for frame in range(4)])
+
+
 def test_the_timeline_shows_status_thumbnails_a_curve_and_a_range(open_viewer: OpenViewer, open_tab: OpenTab) -> None:
     app = open_viewer(frames=60)
     asked: list[int] = []
