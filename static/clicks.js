@@ -11,7 +11,7 @@
   const marks = () => document.querySelectorAll(".carts-document .mark");
   const place = (mark) => mark.dataset.at.split(" ").map(Number);
   const within = (value) => Math.min(Math.max(value, 0), 1);
-  const report = (name, mark, u, v) => window.carts.report("Chosen", { name: `${name} ${mark.dataset.row}`, value: `${u} ${v}` });
+  const report = (name, mark, u, v) => window.carts.report("Chosen", { name: `${name} ${mark.dataset.point}`, value: `${u} ${v}` });
 
   /** Report the motion by arrow keys since the first one was pressed; documents wait until then. */
   function endNudge() {
@@ -66,7 +66,7 @@
       mark.dataset.at = `${within(u + x * STEP / width)} ${within(v + y * STEP / height)}`;
     } else if (["Delete", "Backspace"].includes(event.key)) {
       endNudge();
-      window.carts.report("Chosen", { name: "remove-point", value: mark.dataset.row });
+      if (!event.repeat) window.carts.report("Chosen", { name: "remove-point", value: mark.dataset.point });
     } else return;
     event.preventDefault();
     event.stopPropagation();

@@ -94,7 +94,7 @@
     waiting = held ? [content, place] : null;
     if (held) return;
     const focused = target.contains(document.activeElement) ? document.activeElement : null;
-    const keyOf = ({ do: name, row, value }) => name ? `${name} ${value ?? ""}` : row && `row ${row}`;
+    const keyOf = ({ do: name, point, value }) => name ? `${name} ${value ?? ""}` : point && `point ${point}`;
     const key = focused?.dataset && keyOf(focused.dataset);
     const typed = focused?.type === "text" && focused.value !== focused.defaultValue
       ? [focused.value, focused.selectionStart, focused.selectionEnd] : null;
@@ -112,7 +112,7 @@
       if (part) part.scrollTop = position;
     }
     if (key) {
-      const again = [...target.querySelectorAll("[data-do], [data-row]")].find((other) => keyOf(other.dataset) === key);
+      const again = [...target.querySelectorAll("[data-do], [data-point]")].find((other) => keyOf(other.dataset) === key);
       again?.focus();
       if (typed && again?.type === "text") {
         again.value = typed[0];

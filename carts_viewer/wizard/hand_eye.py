@@ -111,6 +111,7 @@ def hand_eye_panel(
         placeholders=placeholders,
         undoable=undoable,
         calibration_frames=CALIBRATION_FRAMES,
+        keys=[ClickPrompt.of(point).key for point in draft.points],
         done=len({(p.camera, p.frame, p.arm, p.landmark) for p in draft.points}),
         at=prompt or clicking.plan[-1],
         shown=shown,
@@ -259,7 +260,7 @@ class HandEyeStep:
             return self._clicked(draft, prompt, value) if prompt is not None and prompt.key == which else draft
         elif kind == "look":
             self._look(prompt or self._clicking.plan[-1], which, value)
-        elif name == "show-point" and (row := _row(value, draft)) is not None:
+        elif name == "show-point" and (row := _row_of(value, draft)) is not None:
             self._wanted = ClickPrompt.of(draft.points[row])
         elif name == "calibrate":
             self._calibrate()
@@ -278,11 +279,11 @@ class HandEyeStep:
             draft = replace(draft, calibration=draft.offered, offered=None)
         elif name == "discard" and draft.offered is not None:
             draft = draft.uncalibrated()
-        elif kind == "move-point" and (row := _row(which, draft)) is not None:
+        elif kind == "move-point" and (row := _row_of(which, draft)) is not None:
             draft = self._moved(draft, row, value)
-        elif kind == "shift-point" and (row := _row(which, draft)) is not None:
+        elif kind == "shift-point" and (row := _row_of(which, draft)) is not None:
             draft = self._moved(draft, row, value, relative=True)
-        elif name == "remove-point" and (row := _row(value, draft)) is not None:
+        elif name == "remove-point" and (row := _row_of(value, draft)) is not None:
             self._wanted = ClickPrompt.of(draft.points[row])
             draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
         return draft
@@ -441,6 +442,9 @@ class HandEyeStep:
             return str(error)
 
 
-def _row(value: str, draft: Draft) -> int | None:
-    """Index of a clicked point in a choice; None if there is no such point."""
-    return int(value) if value.isdecimal() and len(value) < 9 and int(value) < len(draft.points) else None
+def _row_of(key: str, draft: Draft) -> int | None:
+    """Index of the clicked point whose prompt has this key; None if there is no such point.
+
+    A choice on an earlier document may be one of a point that has been removed since.
+    """
+    return next((row for row, point in enumerate(draft.points) if ClickPrompt.of(point).key == key), None)

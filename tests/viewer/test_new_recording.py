@@ -166,6 +166,35 @@ def test_a_held_arrow_key_moves_a_point_by_all_its_steps_as_one_undo_step(
     assert place.draft.points == (point,)
 
 
+def test_a_held_delete_key_and_a_second_click_on_remove_take_away_one_point(
+    hand_eye: tuple[Visitor, RecordingWizard],
+) -> None:
+    visitor, place = hand_eye
+    page = visitor.page
+    for count, u in enumerate((120.0, 150.0, 180.0, 210.0), start=1):
+        visitor.point_at((u, 120.0), (320, 240))
+        page.locator(".clicks tr").nth(count).wait_for()
+    points = place.draft.points
+    page.locator(".mark").first.focus()
+    for _ in range(5):
+        page.keyboard.down("Delete")
+    page.keyboard.up("Delete")
+    eventually(lambda: len(place.draft.points), lambda count: count < len(points))
+    visitor.site.wait()
+    kept = place.draft.points
+    assert len(kept) == len(points) - 1
+    page.locator(".clicks tr").nth(len(kept) + 1).wait_for(state="detached")
+    page.locator(".clicks button[data-do=remove-point]").first.evaluate(
+        "(button) => { button.click(); button.click(); }"
+    )
+    eventually(lambda: len(place.draft.points), lambda count: count < len(kept))
+    # A later choice has been carried out after both clicks.
+    page.get_by_role("textbox", name="Name", exact=True).fill("after")
+    page.get_by_role("textbox", name="Name", exact=True).blur()
+    eventually(lambda: place.draft.name == "after")
+    assert place.draft.points == kept[1:]
+
+
 def agreement(found: Scene, truth: Sequence, camera: str) -> float:
     """Mean Dice of rendered masks of two calibrations over every third frame."""
     renderers = [Renderer(scene, cameras=[camera]) for scene in (found, truth.scene)]

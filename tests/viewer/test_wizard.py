@@ -44,6 +44,7 @@ from carts_viewer.wizard.calibration import CalibrationJob, target_folder
 from carts_viewer.wizard.check import Guess, check_form, guess
 from carts_viewer.wizard.draft import ClickedPoint, Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import FramePicture
+from carts_viewer.wizard.points import ClickPrompt
 from carts_viewer.wizard.wizard import RecordingWizard
 
 FRAMES = 6
@@ -333,6 +334,11 @@ def place_of(site: Site) -> RecordingWizard:
     return site.shown
 
 
+def keys(place: RecordingWizard) -> list[str]:
+    """The points in the page's messages."""
+    return [ClickPrompt.of(point).key for point in place.draft.points]
+
+
 def ended(site: Site, text: str, timeout: float = PATIENCE) -> Draft:
     """The draft once this is to be read."""
     eventually(lambda: site.document.content, lambda content: text in content, timeout)
@@ -391,8 +397,8 @@ def test_a_calibration_is_stopped_at_any_moment(
 
 def test_two_clicks_on_the_same_prompt_place_one_point(site: Site) -> None:
     place = place_of(site)
-    for _ in range(2):
-        site.post(lambda: place.choose("remove-point", "0"))
+    for key in keys(place)[:2]:
+        site.post(lambda key=key: place.choose("remove-point", key))
     place_of(site)
     assert place.prompt is not None and place.prompt.key in site.document.content
     for at in ("0.5 0.5", "0.6 0.5", "nan 2"):
@@ -401,11 +407,28 @@ def test_two_clicks_on_the_same_prompt_place_one_point(site: Site) -> None:
     assert len(points) == 11 and points[-1].pixel == (160.0, 120.0)
 
 
+def test_two_clicks_on_remove_take_away_one_point(site: Site) -> None:
+    place = place_of(site)
+    first, *others = place.draft.points
+    key = keys(place)[0]
+    # The second one is of a document of before; an unknown point is ignored.
+    for name, value in (
+        ("remove-point", key),
+        ("remove-point", key),
+        ("remove-point", "1"),
+        (f"move-point {key}", "0 0"),
+    ):
+        site.post(lambda name=name, value=value: place.choose(name, value))
+    assert place_of(site).draft.points == tuple(others)
+    site.post(lambda: place.choose("undo", ""))
+    assert place_of(site).draft.points == (first, *others)
+
+
 def test_displacements_of_a_point_add_up(site: Site) -> None:
     place = place_of(site)
     (u, v), others = place.draft.points[0].pixel, place.draft.points[1:]
     for by in ("0.01 0", "0.01 -0.02", "2 0", "0.1"):
-        site.post(lambda by=by: place.choose("shift-point 0", by))
+        site.post(lambda by=by: place.choose(f"shift-point {keys(place)[0]}", by))
     points = place_of(site).draft.points
     assert points[0].pixel == pytest.approx((u + 0.02 * 320, v - 0.02 * 240)) and points[1:] == others
 
@@ -468,8 +491,8 @@ def test_few_points_are_called_ambiguous_until_a_calibration_is_kept(site: Site,
     place, text = place_of(site), "another pose, beyond the standard deviations, can fit these points equally well."
     assert text not in site.document.content
     for _ in range(4):
-        row = next(row for row, point in enumerate(place.draft.points) if point.landmark.startswith("wrist"))
-        site.post(lambda row=row: place.choose("remove-point", str(row)))
+        wrist = next(key for key in keys(place) if key.partition("PSM1/")[2].startswith("wrist"))
+        site.post(lambda wrist=wrist: place.choose("remove-point", wrist))
         site.wait()
     assert f"PSM1 in left: {text} Click the tip and the wrist joints" in site.document.content
     site.post(lambda: place.choose(*CALIBRATE))
