@@ -5,6 +5,8 @@
   let box = null;
   let held = false;
   let waiting = null;
+  let replacing = false; // Chromium reports a change of a field that is removed, whose text is half typed
+  let restored = null; // field whose text was set by `showDocument`, for which leaving it fires no `change`
   let reported = 0; // time of the last report of a slider that is dragged
   const LIVE = 120; // minimum time between such reports [ms]
 
@@ -18,8 +20,14 @@
       });
       box.addEventListener("change", (event) => {
         const field = event.target.closest("select[data-do], input[data-do]");
-        if (!field) return;
+        if (!field || replacing) return;
+        restored = null;
         say(field.dataset.do, field.type === "checkbox" ? (field.checked ? "1" : "0") : field.value);
+      });
+      box.addEventListener("focusout", ({ target: field }) => {
+        if (field !== restored) return;
+        restored = null;
+        if (field.value !== field.defaultValue) say(field.dataset.do, field.value);
       });
       box.addEventListener("keydown", (event) => {
         const field = event.target.closest("[data-enter]");
@@ -103,7 +111,11 @@
     target.className = content ? `carts-document carts-document-${place}` : "";
     target.hidden = !content;
     const top = target.scrollTop;
-    target.replaceChildren(...built(content));
+    const nodes = built(content);
+    restored = null;
+    replacing = true;
+    target.replaceChildren(...nodes);
+    replacing = false;
     window.carts.placeMarks?.();
     target.scrollTop = top;
     for (const part of target.querySelectorAll("details[data-keep]")) part.open ||= opened.includes(part.dataset.keep);
@@ -117,6 +129,7 @@
       if (typed && again?.type === "text") {
         again.value = typed[0];
         again.setSelectionRange(typed[1], typed[2]);
+        restored = again;
       }
     }
     document.documentElement.classList.toggle("carts-documented", Boolean(content));

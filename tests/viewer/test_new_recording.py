@@ -195,6 +195,24 @@ def test_a_held_delete_key_and_a_second_click_on_remove_take_away_one_point(
     assert place.draft.points == kept[1:]
 
 
+def test_a_text_that_is_typed_while_the_document_is_replaced_is_reported_once_the_field_is_left(
+    hand_eye: tuple[Visitor, RecordingWizard],
+) -> None:
+    visitor, place = hand_eye
+    field = visitor.page.get_by_role("textbox", name="Name", exact=True)
+    field.click()
+    field.press("Control+a")
+    visitor.page.keyboard.type("day 4")
+    visitor.page.evaluate("document.querySelector('main input[type=text]').old = true")
+    visitor.site.post(place.show)
+    wait_in(visitor.page, "!document.querySelector('main input[type=text]').old")
+    assert place.draft.name == "day 3"
+    expect(field).to_have_value("day 4")
+    expect(field).to_be_focused()
+    field.blur()
+    eventually(lambda: place.draft.name, lambda name: name == "day 4", 30.0)
+
+
 def agreement(found: Scene, truth: Sequence, camera: str) -> float:
     """Mean Dice of rendered masks of two calibrations over every third frame."""
     renderers = [Renderer(scene, cameras=[camera]) for scene in (found, truth.scene)]
