@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..arrays import Array, array_if_faster, converted, library
 from ..errors import RobotError
@@ -479,6 +479,8 @@ class Robot:
         joint_names: independent degrees of freedom; a mimic joint belongs to the joint that it mimics.
         joint_types: "revolute" or "prismatic", per degree of freedom.
         joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m]; infinite without limits.
+        unlimited: degrees of freedom [dofs] that are revolute without limits, whose positions are equivalent modulo
+            2 pi.
         link_names: links with a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
         decimation: summary of the decimation of the meshes.
@@ -502,6 +504,9 @@ class Robot:
         self.joint_names = kinematics.joint_names
         self.joint_types = kinematics.joint_types
         self.joint_limits = kinematics.joint_limits
+        self.unlimited: Bool[np.ndarray, " dofs"] = (np.array(self.joint_types) == "revolute") & np.isinf(
+            self.joint_limits
+        ).all(1)
         self.link_names = link_names
         self.meshes = meshes
         self.decimation = decimation

@@ -11,7 +11,7 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..errors import SequenceError
 from ..files.reading import ROBOT, TABLE, open_regular, read_text
@@ -270,11 +270,6 @@ class JointColumns:
         """Joints that have a column, in the robot's order."""
         mapped = {column.joint.name for column in self.columns}
         return tuple(name for name in self.robot.joint_names if name in mapped)
-
-    @property
-    def unlimited(self) -> Bool[np.ndarray, " dofs"]:
-        """Which joints are revolute without limits."""
-        return (np.array(self.robot.joint_types) == "revolute") & np.isinf(self.robot.joint_limits).all(1)
 
     def read(self, table: Table) -> Float[np.ndarray, "rows dofs"]:
         """Read the joint positions of all rows [rad], [m], in the robot's order; errors as in `JointColumn.read`."""

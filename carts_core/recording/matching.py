@@ -197,7 +197,7 @@ class Rows:
 
     def _joints(self, arm: TomlTable, table: Table, columns: JointColumns) -> Samples:
         samples = self.samples(table, columns.read(table))
-        return replace(samples, time_offset=self.offset_of(arm), unlimited=columns.unlimited)
+        return replace(samples, time_offset=self.offset_of(arm), unlimited=columns.robot.unlimited)
 
     def read(self, path: Path) -> Table:
         """Read another table, which must have the same frames or the same clock."""

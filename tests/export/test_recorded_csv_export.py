@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from corrected_frames import corrected
+from lab_robots import write_urdf
 from recordings import digests, jaw_at, joints_at, pose_of, write_images
 
 from carts_core.errors import CartsError
@@ -182,6 +183,28 @@ def test_a_frame_shortly_outside_of_the_log_corrects_its_first_or_last_row(tmp_p
     rows = rows_of(export(data, "recorded-csv", tmp_path / "out") / "_PSM1_measured_js.csv", 2)
     found = [float(rows[row][f"position.{number}.corrected"]) for number in range(6)]
     np.testing.assert_allclose(found, data.frames[frame].joint_positions["PSM1"][:6], rtol=0, atol=1e-9)
+
+
+def test_a_continuous_joint_is_corrected_where_it_wraps(tmp_path, shipped_psm):
+    path, half_row = with_a_log(tmp_path / "set"), 0.005
+    log = path / "_PSM1_measured_js.csv"
+    lines = log.read_text().splitlines()
+    for row in range(30):
+        cells = lines[3 + row].split(",")
+        cells[4] = repr(float((row - 8.5) * 1e-3 + (np.pi if row <= 8 else -np.pi)))  # wraps at frame 2
+        lines[3 + row] = ",".join(cells)
+    log.write_text("\n".join(lines) + "\n")
+    data = imported(path, tmp_path / "sequence", ImportOptions(frame_rate=RATE, time_offset=1e-9 * START + half_row))
+    urdf = write_urdf(tmp_path / "turning.urdf", dict.fromkeys(shipped_psm.joint_names, (-9.0, 9.0)))
+    urdf.write_text(urdf.read_text().replace("revolute", "continuous"))
+    text = data.sequence.path.read_text()
+    data.sequence.path.write_text(text.replace("builtin:psm_lnd", str(urdf)))
+    sequence = Sequence.open(data.sequence.path)
+    data = Dataset(sequence, tuple(corrected(sequence)), sequence.scene, "regular")
+    rows = rows_of(export(data, "recorded-csv", tmp_path / "out") / log.name, 2)
+    change = [float(row["position.3.corrected"]) - float(row["position.3"]) for row in rows]
+    # Frame 2 is corrected by 3e-3 cos(3), frame 3 by 4e-3 cos(3); rows between them are interpolated.
+    np.testing.assert_allclose(change[9:12], 1e-3 * np.cos(3) * (3 + np.array([1, 3, 5]) / 8), rtol=0, atol=2e-6)
 
 
 def test_tip_poses_are_corrected_in_their_own_frame(tmp_path):
