@@ -27,6 +27,7 @@ from ...resources import shipped_robot
 from ...settings import ImageSettings
 from ...settings.training import Augmentation, BaselineNetwork, BaselineTraining
 from ..randomization import SURFACE_UNIT, SurfaceGenerator
+from ..training.digests import start_digest
 from ..training.loop import TrainingLoop
 from ..training.tasks import dice
 from .networks import Baseline, save_baseline, segmentation_models, start_from
@@ -298,8 +299,11 @@ class _Run:
         if training.start is not None:
             start_from(self.network, training.start)
         channels_last(self.network.to(training.device))
-        start = training.start.name if training.start else None
-        self.config = json.dumps({"network": asdict(network), **asdict(training), "start": start})
+        start = {
+            "start": training.start.name if training.start else None,
+            "start_digest": start_digest(training.start),
+        }
+        self.config = json.dumps({"network": asdict(network), **asdict(training), **start})
         self.loop = TrainingLoop(output, self.network, training, self.config, _MAY_CHANGE)
 
     def finish(self, say: Callable[[str], None]) -> BaselineResult:

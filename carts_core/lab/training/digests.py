@@ -1,6 +1,7 @@
 """Digests of input files, which identify a training run or an image cache independently of the files' paths."""
 
 import hashlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,12 @@ def run_digests(config: TrainingConfig) -> dict[str, Any]:
         RobotError: a robot cannot be loaded.
         SequenceError: the recording cannot be read.
     """
-    start = None if config.start is None else _digest(read_bytes(config.start, WEIGHTS))
-    return {"start_digest": start, **image_digests(config)}
+    return {"start_digest": start_digest(config.start), **image_digests(config)}
+
+
+def start_digest(start: Path | None) -> str | None:
+    """Digest of a file of initial weights; None without one."""
+    return None if start is None else _digest(read_bytes(start, WEIGHTS))
 
 
 def image_digests(config: TrainingConfig) -> dict[str, Any]:
