@@ -43,29 +43,43 @@ class QueuedIntent(Generic[T]):
     intent: Intent
 
 
+_BOUNDARIES = (intents.Released, intents.ShowFrame)
+"""Classes of intents that give earlier and later intents another meaning: another gesture, or another frame."""
+_WITHOUT_ORDER = (intents.Drawn, intents.Refresh)
+"""Classes of intents whose place among others does not matter."""
+
+
 class IntentQueue(Generic[T]):
-    """Queue of intents, ordered by their newest version. Any thread may put; only the worker takes."""
+    """Queue of intents. Any thread may put; only the worker takes."""
 
     def __init__(self) -> None:
-        self._waiting: dict[Hashable, QueuedIntent[T]] = {}
+        self._waiting: list[tuple[Hashable, QueuedIntent[T]]] = []
         self._changed = threading.Condition()
         self._woken = False
 
     def put(self, tab: T, intent: Intent) -> None:
-        """Add an intent; it replaces a pending one with the same tab and key."""
+        """Add an intent; it replaces a pending one with the same tab and key, unless an intent between them separates
+        the two."""
         with self._changed:
             key = object() if intent.key is None else (tab, intent.key)
-            # Removed first, so that the newest version is queued behind earlier requests.
-            self._waiting.pop(key, None)
-            self._waiting[key] = QueuedIntent(tab, intent)
+            self._remove_older(key)
+            self._waiting.append((key, QueuedIntent(tab, intent)))
             self._changed.notify()
+
+    def _remove_older(self, key: Hashable) -> None:
+        for place in reversed(range(len(self._waiting))):
+            if self._waiting[place][0] == key:
+                older = self._waiting[place][1]
+                if not any(_separates(older, other) for _, other in self._waiting[place + 1 :]):
+                    del self._waiting[place]
+                return
 
     def take(self, timeout: float | None = None) -> list[QueuedIntent[T]]:
         """Take all pending intents; if there are none, wait up to `timeout` [s] for one (None: without limit)."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._woken, timeout)
             self._woken = False
-            waiting = list(self._waiting.values())
+            waiting = [queued for _, queued in self._waiting]
             self._waiting.clear()
             return waiting
 
@@ -83,7 +97,20 @@ class IntentQueue(Generic[T]):
     def waits(self, tab: T, key: Hashable) -> bool:
         """Whether an intent with this tab and key is pending."""
         with self._changed:
-            return (tab, key) in self._waiting
+            return any(pending == (tab, key) for pending, _ in self._waiting)
+
+
+def _separates(older: QueuedIntent[T], between: QueuedIntent[T]) -> bool:
+    """Whether an intent must not be replaced by a newer one because of another intent that was queued after it."""
+    if (
+        between.tab != older.tab
+        or isinstance(older.intent, _WITHOUT_ORDER)
+        or isinstance(between.intent, _WITHOUT_ORDER)
+    ):
+        return False
+    return (
+        between.intent.key is None or isinstance(between.intent, _BOUNDARIES) or isinstance(older.intent, _BOUNDARIES)
+    )
 
 
 RECONNECT_TIME = 20.0

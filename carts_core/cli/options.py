@@ -323,8 +323,8 @@ class SolverOptions:
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """Check that the solver is a `SurfaceSolver`, whose standard deviations `what` requires."""
-        if not isinstance(self.chosen, SurfaceSolver):
+        """Check that the solver is `surface`, whose standard deviations `what` requires."""
+        if self.solver is not SolverName.SURFACE:
             raise SettingsError(
                 f"{what} requires --solver surface, but --solver {self.solver} was given. Remove one of the options."
             )
@@ -348,14 +348,16 @@ class CalibrationOptions:
     @property
     def chosen(self) -> SurfaceSolver:
         """Settings of the solver."""
-        return changed(CALIBRATION_SETTINGS, _table(self.settings, "solver"), "[solver]")
+        return changed(CALIBRATION_SETTINGS, _table(self.settings, "solver", ("solver",)), "[solver]")
 
     def printed(self) -> str:
         """All settings, formatted as a settings file."""
         return tomlkit.dumps({"solver": to_plain(self.chosen)})
 
 
-def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
+def _table(
+    given: tuple[str, ...], name: str, allowed: tuple[str, ...] = ("solver", "sequence", "free")
+) -> dict[str, Any]:
     """Table `name` of all --settings merged; later values take precedence."""
     found: dict[str, Any] = {}
     for text in given:
@@ -367,10 +369,11 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
             raise SettingsError(f"--settings {text} cannot be read: {error}. {remedy}") from error
         except ValueError as error:
             raise SettingsError(f"--settings {text} is not TOML: {error}. {remedy}") from error
-        strangers = set(content) - {"solver", "sequence", "free"}
+        strangers = set(content) - set(allowed)
         if strangers or not all(isinstance(table, dict) for table in content.values()):
             wrong = ", ".join(sorted(strangers)) or "values outside tables"
-            raise SettingsError(f"--settings {text} contains {wrong}; allowed: tables [solver], [sequence], [free].")
+            tables = ", ".join(f"[{table}]" for table in allowed)
+            raise SettingsError(f"--settings {text} contains {wrong}; allowed: tables {tables}.")
         found.update(content.get(name, {}))
     return found
 
@@ -432,12 +435,13 @@ class Observer:
             return
         frames = list(frames)
         for camera, domain in product(cameras, domains):
-            without = [index for index in frames if not self.has_mask(sequence, index, camera, domain)]
+            shown = sequence.with_image(frames, [camera])
+            without = [index for index in shown if not self.has_mask(sequence, index, camera, domain)]
             # If the network is also used, recorded masks may be missing, but external masks must belong to this
             # recording.
-            if without and (self.every or (self.given is not None and len(without) == len(frames))):
+            if without and (self.every or (self.given is not None and len(without) == len(shown))):
                 raise SettingsError(
-                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} for camera "
+                    f"{len(without)} of {counted(len(shown), 'frame')} have no {self._origin} for camera "
                     f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}. Choose other frames or "
                     "cameras with --frames and --camera, or use the network for these frames with --observe both."
                 )

@@ -61,8 +61,8 @@ def joint_mae_deg(
     errors = []
     for arm in scene.arms:
         if arm.name in truth:
-            difference = np.abs(np.asarray(estimate[arm.name]) - np.asarray(truth[arm.name]))
-            errors += _revolute(arm, difference, joints)
+            difference = arm.robot.difference(estimate[arm.name], truth[arm.name])
+            errors += _revolute(arm, np.abs(difference), joints)
     return float(np.rad2deg(np.mean(errors))) if errors else None
 
 

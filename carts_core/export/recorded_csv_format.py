@@ -166,10 +166,9 @@ def _by_time(
     at = np.array([timestamps[frames[number].index] for number in own]) + sequence.checked_matching().time_offset
     # A frame shortly before the first row, or after the last one, has the values of that row.
     at = np.clip(at, times[0], times[-1])
-    unlimited = sequence.scene.arm(arm).robot.unlimited
-    measured = at_times(at, times, np.where(unlimited, np.unwrap(values, axis=0), values))
-    corrections = np.stack([frames[number].joint_positions[arm] for number in own]) - measured
-    corrections -= np.where(unlimited, 2.0 * np.pi * np.round(corrections / (2.0 * np.pi)), 0.0)
+    robot = sequence.scene.arm(arm).robot
+    measured = at_times(at, times, np.where(robot.unlimited, np.unwrap(values, axis=0), values))
+    corrections = robot.difference(np.stack([frames[number].joint_positions[arm] for number in own]), measured)
     deviations = np.stack([(frames[n].joint_std or {}).get(arm, np.full(values.shape[1], np.nan)) for n in own])
     indices = np.array([frames[number].index for number in own])
     after = np.clip(np.searchsorted(at, times - _SAME_CLOCK), 0, len(at) - 1)

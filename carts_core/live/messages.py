@@ -2,6 +2,7 @@
 
 import math
 import socket
+import statistics
 import struct
 import threading
 import time
@@ -301,7 +302,7 @@ class LatestFrame:
     """
 
     _RECENT = 20
-    """Number of frames over which the interval is averaged."""
+    """Number of frames over which interval and decoding time are averaged."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -310,6 +311,10 @@ class LatestFrame:
         self._changed = threading.Condition()
         self.arrived = self.dropped = 0
         self._times = deque[float](maxlen=self._RECENT)
+        self._delays = deque[float](maxlen=self._RECENT)
+        """Times from arrival to the end of decoding of recent frames [s]."""
+        self._fresh_at = 0.0
+        """Time at which the latest frame would usually be decoded [s, monotonic]."""
         self._thread = threading.Thread(target=self._read, name="carts-live-source", daemon=True)
         self._thread.start()
 
@@ -317,8 +322,8 @@ class LatestFrame:
         """Wait for the latest frame; None at the end of the stream.
 
         Args:
-            patience: age beyond which a frame is held back until the next one arrives, for at most `_NEXT` [s]. The
-                frame that is then the latest is returned whatever its age.
+            patience: age, without the usual time for decoding, beyond which a frame is held back until the next one
+                arrives, for at most `_NEXT` [s]. The frame that is then the latest is returned whatever its age.
 
         Raises:
             CartsError: the source failed.
@@ -327,7 +332,7 @@ class LatestFrame:
         with self._changed:
             while True:
                 moment = self._moment
-                if moment is not None and (waited or self._ended or time.monotonic() - moment.arrived <= patience):
+                if moment is not None and (waited or self._ended or time.monotonic() - self._fresh_at <= patience):
                     self._moment = None
                     return moment
                 if self._ended:
@@ -355,6 +360,8 @@ class LatestFrame:
                 with self._changed:
                     self.arrived += 1
                     self._times.append(moment.arrived)
+                    self._delays.append(time.monotonic() - moment.arrived)
+                    self._fresh_at = moment.arrived + statistics.median_low(self._delays)
                     self.dropped += self._moment is not None
                     self._moment = moment
                     self._changed.notify()

@@ -222,6 +222,7 @@ class LiveTracker:
         self._colours = ColourTracker(self._model)
         self._moving = False
         self._errors: ErrorModel | None = None
+        self._groups: list[range] = []
         self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
         self._start_over()
 
@@ -514,7 +515,7 @@ class LiveTracker:
         worst = max(self.live.bad_factor * usual, 0.5 * self.live.bad_loss)
         if measurement.loss > min(self.live.bad_loss, worst):
             return False
-        return self._filtered is not None and not measurement.information.contradicts(attempt.expected)
+        return self._filtered is not None and not measurement.information.contradicts(attempt.expected, self._groups)
 
     def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> Gaussian:
         """Update the filter with a good frame, weighted for the correlation with the previous frame.
@@ -552,4 +553,5 @@ class LiveTracker:
         if self._errors is None:
             priors = self._model.constant_deg, self.settings.frame_prior_deg, self.settings.intrinsics_prior
             self._errors = ErrorModel(self._model, variables.expected(*priors).cpu().double().numpy())
+            self._groups = variables.groups
         return self._errors

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from ..arrays import Array, array_if_faster, converted, library
 from ..errors import RobotError
@@ -512,6 +513,11 @@ class Robot:
         self.decimation = decimation
         self.remarks = remarks
         self._kinematics = kinematics
+
+    def difference(self, positions: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*batch dofs"]:
+        """Difference of joint positions [..., dofs] [rad, m]; by at most pi for joints without limits."""
+        step = np.asarray(positions, np.float64) - np.asarray(reference, np.float64)
+        return step - np.where(self.unlimited, 2.0 * np.pi * np.round(step / (2.0 * np.pi)), 0.0)
 
     def __repr__(self) -> str:
         faces = sum(len(mesh.faces) for mesh in self.meshes)

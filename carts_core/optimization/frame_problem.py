@@ -392,7 +392,7 @@ class FrameProblem:
         The area has the same weights as the cost, so that losses of clear and hazy images are comparable.
         """
         coverage = compared.rendering.maps[:, COVERAGE].sum(1)
-        rendered = total(coverage * factor.certainty[:, 0]) * factor.area
+        rendered = total(coverage * (factor.weight * factor.certainty)[:, 0]) * factor.area
         return 2.0 * compared.pixels / (0.5 * max(rendered + self.observation.area, 1.0))
 
     def aligned(

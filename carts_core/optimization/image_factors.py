@@ -61,6 +61,7 @@ class SurfaceFactor:
         area: area of a pixel [px of the working image].
         size: width and height of the compared images [px].
         window: the compared part of the images [px].
+        weight: 0 for ignored pixels, 1 for others [1].
         certainty: information of a pixel, relative to a clear image [1].
     """
 
@@ -85,7 +86,7 @@ class SurfaceFactor:
         self.renderer = Renderer(
             scene, width=self.size[0], height=self.size[1], window=astuple(self.window), device=device
         )
-        self._weight = functional.avg_pool2d(observation.weight, reduction)
+        self.weight = functional.avg_pool2d(observation.weight, reduction)
         self.certainty = functional.avg_pool2d(observation.certainty, reduction)
         self._total_only = not observation.knows_parts
         self._observed = self._blurred(functional.avg_pool2d(observation.maps * observation.weight, reduction))
@@ -139,12 +140,12 @@ class SurfaceFactor:
             0.5 * self.area * total(squared * ratio * self.certainty),
             rendering,
             (1.0 - squared[:, 0]).clamp(min=-1.0),
-            (ratio.square() * self._weight * self.certainty)[:, 0],
+            (ratio.square() * self.weight * self.certainty)[:, 0],
         )
 
     def _difference(self, maps: Float[Tensor, "*batch cameras 6 h w"]) -> tuple[Tensor, Tensor, Tensor]:
         """Blurred maps, squared residuals of pixels, and robust weights in (0, 1]."""
-        model = self._blurred(maps * self._weight)
+        model = self._blurred(maps * self.weight)
         squared = ((self._observed - model).square() * self._channels).sum(-3, keepdim=True)
         # Geman-McClure: the cost of residuals far beyond the scale saturates, and their gradient vanishes.
         return model, squared, 1.0 / (1.0 + squared / self._robust**2)
@@ -169,7 +170,7 @@ class SurfaceFactor:
         for block in jacobian:
             rows, columns = block.values.shape[-2:]
             window = Window(block.left, block.top, columns, rows)
-            values = self._blurred(block.values * window.of(self._weight))
+            values = self._blurred(block.values * window.of(self.weight))
             weighted = (values * window.of(weight)).flatten(1)
             gradient[block.unknowns] = -weighted @ window.of(residual).flatten()
             outline[block.unknowns] = weighted @ window.of(grown).flatten()
@@ -379,7 +380,7 @@ class LocalEdgeFactor:
     """
 
     def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor, weight: float) -> None:
-        self._factor, self._counts, self._weight = factor, counts, weight
+        self._factor, self._counts, self.weight = factor, counts, weight
         self._tangents = factor.renderer.tangents(factor.variables.around(offsets), DIFFERENCE_SPAN)
         self._render(offsets)
 
@@ -391,7 +392,7 @@ class LocalEdgeFactor:
         """The quadratic model around a point."""
         if self._outline.moved_by(offsets - self._rendered_at) > _RENDERED_ANEW:
             self._render(offsets)
-        return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self._weight)
+        return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self.weight)
 
     def cost(self) -> float:
         """Edge cost of the last rendered outlines; see `EdgeFactor.cost`."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 
 import numpy as np
@@ -47,6 +48,17 @@ class Information:
     def __add__(self, other: "Information") -> "Information":
         return Information(self.precision + other.precision, self.vector + other.vector)
 
+    def of(self, expected: Gaussian, group: range) -> tuple["Information", Gaussian]:
+        """Information on some of the unknowns if the others are as predicted, and the prediction of these."""
+        own, others = slice(group.start, group.stop), np.setdiff1d(np.arange(len(self.vector)), group)
+        known = self.vector[own] - self.precision[own, others] @ expected.mean[others]
+        return Information(self.precision[own, own], known), Gaussian(expected.mean[own], expected.covariance[own, own])
+
+    @cached_property
+    def any(self) -> bool:
+        """Whether a direction is measured; False for an image without arms."""
+        return bool(np.linalg.eigvalsh(self.precision)[-1] > _MEASURED)
+
     def mahalanobis(self, expected: Gaussian) -> float:
         """Squared Mahalanobis distance from the prediction, averaged over the measured directions [1].
 
@@ -72,9 +84,12 @@ class Information:
         spread = np.linalg.inv(L) + measured.T @ expected.covariance @ measured
         return np.linalg.solve(L, measured.T @ residual), spread
 
-    def contradicts(self, expected: Gaussian) -> bool:
-        """Whether the correction deviates from the prediction by three standard deviations or more, on average."""
-        return self.mahalanobis(expected) > _CONTRADICTS
+    def contradicts(self, expected: Gaussian, groups: Sequence[range]) -> bool:
+        """Whether the correction of a group of unknowns, such as an arm, deviates from its prediction by three standard
+        deviations or more, on average."""
+        return any(
+            own.mahalanobis(there) > _CONTRADICTS for own, there in (self.of(expected, group) for group in groups)
+        )
 
 
 _CONTRADICTS = 9.0

@@ -144,6 +144,9 @@ class MaskPredictor:
         """
         network = None if self._network is None else self._network.for_frame(frame, cameras)
         given = (frame.masks or {}) if self._masks is None else self._masks(frame.index)
+        # A missing image has no weight, so it needs no mask.
+        nothing = {name: np.zeros(frame.images[name].shape[:2], bool) for name in frame.missing if name not in given}
+        given = {**nothing, **given}
         missing = [name for name in cameras if name not in given]
         if missing and network is not None:
             return network

@@ -268,8 +268,10 @@ class SequenceOptimizer:
 
     @property
     def _begun(self) -> bool:
-        """Whether a keyframe or a frame with an image has been visited."""
-        return any(not visit.blank or index in self._keyframes for index, visit in self._visits.items())
+        """Whether a keyframe or a frame whose image shows an arm has been visited."""
+        return any(
+            visit.measurement.information.any or index in self._keyframes for index, visit in self._visits.items()
+        )
 
     def _is_blank(self, frame: Frame) -> bool:
         """Whether a frame has no image of any camera."""
@@ -427,8 +429,9 @@ class SequenceOptimizer:
             start, measurement = Origin.WARM, found
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
-            contradicts = self._begun and measurement.information.contradicts(expected)
-            usual = not (lost or contradicts) and measurement.loss <= self._unusual_loss()
+            contradicts = self._begun and measurement.information.contradicts(expected, variables.groups)
+            fits = measurement.information.any and not (lost or contradicts)
+            usual = fits and measurement.loss <= self._unusual_loss()
             routine = usual and start is Origin.WARM and self._tracker.ready
             self._tracker.learn(self._solver, frame, variables, measurement, usual)
             if contradicts:
@@ -458,7 +461,7 @@ class SequenceOptimizer:
         if warm.loss > usual:
             wide = self._solver.warm(frame, variables, expected, expected.mean, wide=True)
             warm = replace(min(warm, wide, key=lambda found: found.loss), iterations=warm.iterations + wide.iterations)
-        if warm.loss <= usual:
+        if warm.loss <= usual or not (warm.information.any or self._is_in_view(frame, variables, expected)):
             return Origin.WARM, warm, False
         cold = self._solver.cold(frame, variables, self._prior)
         best = min(warm, cold, key=lambda measurement: measurement.loss)
@@ -466,10 +469,14 @@ class SequenceOptimizer:
         lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
         return Origin.WARM if best.loss == warm.loss else Origin.COLD, best, lost
 
+    def _is_in_view(self, frame: Frame, variables: Variables, expected: Gaussian) -> bool:
+        """Whether an arm is in view at the measured values."""
+        return self._solver.at(frame, variables, expected, np.zeros(len(variables))).information.any
+
     def _unusual_loss(self) -> float:
-        """Loss above which a frame gets a cold start."""
+        """Loss above which a frame gets a cold start; frames without arms in view are not counted."""
         visits = [self._visits[index] for index in self._seen]
-        losses = [visit.measurement.loss for visit in visits if visit.start is not Origin.CARRIED]
+        losses = [visit.measurement.loss for visit in visits if visit.measurement.information.any]
         return self.model.cold_factor * statistics.median(losses or [math.inf])
 
     def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
@@ -492,7 +499,9 @@ class SequenceOptimizer:
                 continue
             visit, smoothed = self._visits[index], corrections[index]
             certain = Gaussian(smoothed.mean, np.zeros_like(smoothed.covariance))
-            if visit.start is Origin.CARRIED or visit.measurement.information.contradicts(certain):
+            if visit.start is Origin.CARRIED or visit.measurement.information.contradicts(
+                certain, visit.variables.groups
+            ):
                 chosen.append((index, remove_measurement(smoothed, visit.measurement.information)))
         return chosen
 
@@ -502,7 +511,7 @@ class SequenceOptimizer:
         earlier = self._visits[index]
         measurement = self._solver.warm(frame, variables, expected, expected.mean)
         start = Origin.WARM
-        if measurement.information.contradicts(expected):
+        if measurement.information.contradicts(expected, variables.groups):
             start, measurement = Origin.CARRIED, measurement.left_out()
         measurement = replace(measurement, iterations=earlier.measurement.iterations + measurement.iterations)
         seconds = earlier.seconds + time.perf_counter() - began

@@ -368,7 +368,11 @@ class ColourTracker:
         found, likelihood = solver.between(frame, variables, expected, self._colours, stage)
         usual = likelihood if self._usual is None else self._usual
         least = np.maximum(self._model.min_likelihood, _USUAL_SHARE * np.nan_to_num(usual))
-        if np.isnan(likelihood).all() or (likelihood < least).any() or found.information.contradicts(expected):
+        if (
+            np.isnan(likelihood).all()
+            or (likelihood < least).any()
+            or found.information.contradicts(expected, variables.groups)
+        ):
             self._wait()
             return None
         mean = (1.0 - _NEWEST) * usual + _NEWEST * likelihood

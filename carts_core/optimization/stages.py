@@ -37,7 +37,7 @@ from .observability import Evaluation
 from .observation import MIN_AREA_RATIO
 from .results import StopReason
 from .variables import Variables
-from .verdict import Assessment, Verdict, assess
+from .verdict import MIN_ARM_AREA, Assessment, Verdict, assess
 
 
 class Problem(Protocol):
@@ -145,18 +145,22 @@ _SUPPORT = 0.5
 
 
 def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
-    """Whether an arm visible at the start has left the image, or most of its silhouette was not observed as arm."""
+    """Whether an arm visible at the start has left the image, or most of its silhouette was not observed as arm.
+
+    Arms of less than `MIN_ARM_AREA` at the start, and ignored pixels, are not considered.
+    """
     seen, images = problem.observation, problem.observation.images
     before, after = (problem.variables.state(point) for point in (problem.start, offsets))
     start, end = (images.renderer.segment(state) for state in (before, after))
     found = seen.window.of(torch.from_numpy(end)).to(seen.maps.device)
-    coverage = seen.coverage
+    weight = seen.weight[:, 0]
+    coverage = seen.coverage * weight
     for arm in range(len(problem.scene.arms)):
         here = found == arm
-        if not (start == arm).any():
+        if (start == arm).sum() < MIN_ARM_AREA * start.size:
             continue
         left = images.still_in_view(arm, (start, before), (end, after)) < MIN_AREA_RATIO
-        if left or total(coverage[here]) < _SUPPORT * int(here.sum()):
+        if left or total(coverage[here]) < _SUPPORT * total(weight[here]):
             return True
     return False
 

@@ -58,6 +58,7 @@ class Variables:
         self.names: list[str] = []
         self._blocks: list[_Block] = []
         self._joint_scales: dict[int, Tensor] = {}
+        self._robots = [arm.robot for arm in scene.arms]
         self._check_names(scene, free)
         chosen = [i for i, arm in enumerate(scene.arms) if not free.arms or arm.name in free.arms]
         lower, upper = [], []
@@ -138,13 +139,14 @@ class Variables:
         return [(name, *unit) for name, unit in zip(self.names, read, strict=True)]
 
     def joint_offsets(self, joint_positions: Sequence[ArrayLike]) -> Float[np.ndarray, " n"]:
-        """Offsets that move the arms to joint positions [rad, m]; NaN for unknowns other than joints."""
+        """Offsets that move the arms to joint positions [rad, m], by at most half a turn for joints without limits; NaN
+        for unknowns other than joints."""
         offsets = np.full(len(self), math.nan)
         for block in self._blocks:
             if block.kind == "joints":
                 columns = list(block.columns)
                 start = self.start.joint_positions[block.index].cpu().double().numpy()
-                step = np.asarray(joint_positions[block.index], np.float64)[columns] - start[columns]
+                step = self._robots[block.index].difference(joint_positions[block.index], start)[columns]
                 offsets[block.start : block.start + block.size] = step / self._joint_scales[block.start].numpy()
         return offsets
 

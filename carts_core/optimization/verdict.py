@@ -76,7 +76,7 @@ _MARGIN, _RIM = 16, 8
 """Margin of the network's input around the arms, and distance within which predictions count [px of the working
 image]."""
 
-_SHOWN, _INFORMATIVE = 2e-3, 0.3
+MIN_ARM_AREA, _INFORMATIVE = 2e-3, 0.3
 """Minimum area of a separately assessed arm, as a share of the images, and minimum share of an arm with informative
 change [1].
 """
@@ -104,8 +104,8 @@ class Evidence(ArmEvidence):
     """Share of the rendered arms that differs from the mean background [1]; None if the background is unknown or
     uninformative."""
     still_in_view: float = 1.0
-    """Minimum ratio of an arm's area to its area at the start, over the arms initially in view [1]; parts occluded by
-    another arm count as in view.
+    """Minimum ratio of an arm's area to its area at the start, over the arms of at least `MIN_ARM_AREA` at the start
+    [1]; parts occluded by another arm count as in view. An arm of which less is in view may leave the image.
     """
     elsewhere: float = 0.0
     """If an arm is out of view: predicted coverage far from the other arms that differs from the mean background, as a
@@ -117,6 +117,11 @@ class Evidence(ArmEvidence):
     """
     masked: bool = False
     """Whether the predictions are given masks, which are compared in the whole image."""
+
+    @property
+    def without_arms(self) -> bool:
+        """Whether no arm is in view, neither at the start nor at the fit, and none is predicted elsewhere."""
+        return max(self.start_area, self.area) < OUT_OF_VIEW and not arm_is_elsewhere(self)
 
 
 @torch.no_grad()
@@ -150,7 +155,7 @@ def evidence(
             shares.append(_share(parts[:, [part]].clamp(0.0, 1.0), shown))
     informative = change is not None and _share(change[0], rendered) > _INFORMATIVE
     areas = {arm: int((before_labels == arm).sum()) for arm in range(len(start.joint_positions))}
-    visible = [arm for arm, pixels in areas.items() if pixels >= OUT_OF_VIEW * labels.size]
+    visible = [arm for arm, pixels in areas.items() if pixels >= MIN_ARM_AREA * labels.size]
     in_view = [images.still_in_view(arm, (before_labels, start), (labels, end)) for arm in visible]
     return Evidence(
         **asdict(worst),
@@ -193,7 +198,7 @@ def _places(
     """Pixel weights of each visible arm and its surroundings, excluding other arms; all pixels if `whole`."""
     labels = window.of(torch.from_numpy(arm_ids).to(weight.device))[:, None]
     arms = [labels == arm for arm in range(count)]
-    shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * arm_ids.size]
+    shown = [arm for arm in arms if float((arm * weight).sum()) >= MIN_ARM_AREA * arm_ids.size]
     if whole or len(shown) < 2:
         silhouette = (labels >= 0).to(weight)
         return [weight if whole else _around(silhouette, images.scale) * weight]
@@ -337,7 +342,8 @@ which the mask does not show arms [1]."""
 
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
-        lambda found: found.start_area < OUT_OF_VIEW,
+        # A given mask may be far from the start.
+        lambda found: max(found.start_area, found.area if found.masked else 0.0) < OUT_OF_VIEW,
         "No arm is in view: at the measured joints, the arms are outside the image or behind the camera.",
         "Check T_camera_world, T_world_base and the units of the joints, or leave the frame out.",
     ),
@@ -514,9 +520,11 @@ class SequenceAssessment:
 
 
 def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
-    """Verdict on a sequence of at least one frame."""
+    """Verdict on a sequence of at least one frame; frames without arms are counted, but not judged."""
+    named = {verdict.value: sum(frame.verdict is verdict for frame in frames) for verdict in Verdict}
+    # Frames without an arm say nothing about the others, unless no frame shows an arm.
+    frames = [frame for frame in frames if not frame.evidence.without_arms] or frames
     counts = Counter(frame.verdict for frame in frames)
-    named = {verdict.value: counts[verdict] for verdict in Verdict}
     probability = float(np.mean([frame.probability for frame in frames]))
     against = Counter((frame.reason, frame.remedy) for frame in frames if frame.verdict is not Verdict.GOOD)
     share = len(frames) - counts[Verdict.GOOD]

@@ -99,5 +99,5 @@ class LiveSettings(Ranged):
     blind_seconds: Seconds = 5.0
     """The same interval while no arm is predicted in the images [s]."""
     oldest_seconds: Seconds = 0.1
-    """Maximum age of a result [s]; a frame whose result is expected to be older is dropped if another frame arrives
-    within 0.5 s, which is then tracked whatever its age."""
+    """Maximum age of a result, without the usual time for decoding [s]; a frame whose result is expected to be older is
+    dropped if another frame arrives within 0.5 s, which is then tracked whatever its age."""

@@ -31,7 +31,7 @@ from carts_viewer.jobs.job_list import (
     SolveOptions,
 )
 from carts_viewer.jobs.networks import Networks
-from carts_viewer.jobs.optimizers import OptimizerFactory, wait_for
+from carts_viewer.jobs.optimizers import REPLY_WAIT, OptimizerFactory, wait_for
 from carts_viewer.jobs.work import Progress, adapt, calibrate, optimize_frames
 from carts_viewer.state import ViewState
 
@@ -98,7 +98,10 @@ class JobsHandler(Handler):
 
     def wait_time(self) -> float | None:
         """Time until the next step is due [s]; None if no job is active."""
-        active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
+        running = self._running()
+        if running is not None and running.kind in ("solve", "export"):
+            return REPLY_WAIT  # Their own handlers say when work is due.
+        active = running is not None or any(job.state is JobState.WAITING for job in self._list.jobs)
         return max(self._wait, wait_for(self._reply)) if active else None
 
     # ---- Intents ---------------------------------------------------------------------------------------------------

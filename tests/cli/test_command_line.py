@@ -176,6 +176,7 @@ def test_an_optimization_that_cannot_be_done_leaves_nothing_behind(
         (["--domain", "regular", "fog"], "domain 'fog' is not in"),
         (["--mode", "sequence", "--keyframes", "nowhere.csv"], "nowhere.csv is not a readable kinematics table"),
         (["--mode", "sequence", "--solver", "acs"], "requires --solver surface"),
+        (["--mode", "sequence", "--solver", "none"], "requires --solver surface"),
     ):
         assert message in refused("optimize", sequence, "--output", tmp_path / "out", *arguments)
         assert not (tmp_path / "out").exists()

@@ -100,8 +100,24 @@ def test_the_mahalanobis_distance_is_about_one_where_the_model_holds_however_muc
     values = [Information(precision, precision @ draw).mahalanobis(expected) for draw in draws]
     assert np.mean(values) == pytest.approx(1.0, abs=0.15)
     far = Information(precision, precision @ np.full(N, 0.9))
-    assert far.mahalanobis(expected) > 50 and far.contradicts(expected)
+    assert far.mahalanobis(expected) > 50 and far.contradicts(expected, [range(N)])
+    assert Information.nothing(N).any is False and far.any
     assert Information.nothing(N).mahalanobis(expected) == 0
+
+
+def test_an_arm_that_jumped_contradicts_however_many_others_did_not() -> None:
+    count, std = 7, 0.005
+    expected = Gaussian(np.zeros(3 * count), std**2 * np.eye(3 * count))
+    precision = np.eye(3 * count) / std**2
+    jumped = np.zeros(3 * count)
+    jumped[:2] = np.deg2rad(3.5)
+    found, arms = Information(precision, precision @ jumped), [range(at, at + count) for at in (0, count, 2 * count)]
+    assert (
+        found.mahalanobis(expected)
+        < 9
+        < max(own.mahalanobis(there) for own, there in map(found.of, [expected] * 3, arms))
+    )
+    assert found.contradicts(expected, arms) and not found.contradicts(expected, arms[1:])
 
 
 @pytest.mark.parametrize(("errors", "wide"), [(1.0, False), (2.5, True)])

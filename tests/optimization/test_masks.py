@@ -96,6 +96,21 @@ def test_with_a_network_the_mask_says_where_and_the_network_which_part(sequence:
     assert without is network
 
 
+def test_a_missing_image_needs_no_mask(tiny_sequence: Callable[..., Path]) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left", "right"), **SIZE))
+    frame = sequence.frame(0)
+    black = {**frame.images, "right": np.zeros_like(frame.images["right"])}
+    masks = {"left": (frame.masks or {})["left"]}
+    lacking = replace(frame, images=black, masks=masks, missing=("right",))
+    network = PerfectPredictor(sequence, sequence.scene.state(frame.truth or {}))
+    assert MaskPredictor(network).for_frame(lacking, ["left", "right"]) is not network
+    optimizer = FrameOptimizer(sequence.scene, lacking, {}, MaskPredictor())
+    list(optimizer)
+    assert optimizer.best is not None
+    found = Renderer(sequence.scene, cameras=["left"]).segment(optimizer.best.state.with_camera(0))[0] >= 0
+    assert dice(found, masks["left"]) > 0.97
+
+
 def test_frames_without_a_usable_mask_are_named(sequence: Sequence) -> None:
     frame = replace(sequence.frame(1), masks=None)
     with pytest.raises(SettingsError, match=r"frame 002 has no mask for camera 'left' to fit\. Give a mask"):

@@ -7,6 +7,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+import torch
 from perfect_predictor import PerfectPredictor
 from short_sequence import ALONE, ARM, FRAMES, Truths, optimizer
 
@@ -236,6 +237,33 @@ def test_frames_without_an_image_are_carried_and_not_assessed(truths: Truths) ->
     nothing = SequenceOptimizer(truths.sequence.scene, load, {2: None, 3: None}, truths)
     list(nothing)
     assert nothing.assessment is None and nothing.base_frame_gain() is None and len(nothing.estimates) == 2
+
+
+def test_a_recording_that_begins_before_the_arm_is_in_view(truths: Truths) -> None:
+    """Something else is detected in the first frames."""
+    absent, outside = {0, 1}, np.array([1.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    scene = truths.sequence.scene
+
+    def load(index: int) -> Frame:
+        frame = truths.load(index)
+        if index in absent:
+            truths.maps = torch.zeros_like(truths.maps)
+            truths.maps[:, 1, 100:300, 100:300] = 1.0
+            frame = replace(frame, measured={ARM: frame.measured[ARM] + outside})
+        return frame
+
+    assert (Renderer(scene).segment(scene.state(load(0).measured)) < 0).all()
+    times = {index: float(index) / 10 for index in range(FRAMES)}
+    model = SequenceSettings(initial_frames=2, between=())
+    sequence = SequenceOptimizer(scene, load, times, truths, model=model)
+    list(sequence)
+    estimates = sequence.estimates
+    assert estimates[2].start == "cold" and estimates[3].start == "warm"
+    for index in set(range(FRAMES)) - absent:
+        assert error(truths, index, estimates[index].joint_positions)[:2].max() < np.deg2rad(0.3)
+    for index in absent:
+        assert estimates[index].assessment is not None and estimates[index].assessment.nothing_there
+    assert sequence.assessment is not None and sequence.assessment.counts["good"] == FRAMES - len(absent)
 
 
 def test_a_jump_of_the_error_begins_anew(truths: Truths) -> None:

@@ -1,8 +1,11 @@
 """Unknowns as one vector."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from lab_robots import write_urdf
 from tiny import tiny_scene
 
 from carts_core.errors import CartsError
@@ -33,6 +36,15 @@ def test_zero_offsets_are_the_start(scene: Scene) -> None:
     assert torch.allclose(state.T_world_base, parameters.start.T_world_base)
     assert torch.allclose(state.T_camera_world, parameters.start.T_camera_world, atol=1e-6)
     assert torch.allclose(state.intrinsics, parameters.start.intrinsics)
+
+
+def test_a_joint_without_limits_is_moved_by_at_most_half_a_turn(tmp_path: Path) -> None:
+    urdf = write_urdf(tmp_path / "turning.urdf", {"turn": (-9.0, 9.0), "bend": (-9.0, 9.0)})
+    text = urdf.read_text()
+    urdf.write_text(text.replace("revolute", "continuous", 1))
+    robot = Robot.load(urdf)
+    assert robot.unlimited.tolist() == [True, False]
+    np.testing.assert_allclose(robot.difference([3.1, 3.1], [-3.1, -3.1]), [6.2 - 2 * np.pi, 6.2])
 
 
 def test_a_prismatic_joint_moves_by_the_lever(scene: Scene) -> None:

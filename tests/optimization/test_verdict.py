@@ -33,7 +33,7 @@ from carts_core.optimization import (
 from carts_core.optimization.observation import FrameImages
 from carts_core.optimization.results import Uncertainty
 from carts_core.optimization.verdict import (
-    _SHOWN,
+    MIN_ARM_AREA,
     assess,
     assess_calibration,
     assess_sequence,
@@ -96,6 +96,8 @@ def test_a_mask_that_is_black_on_the_arms_or_shows_none_has_failed() -> None:
     assert assess(replace(masked, area=0.7, start_area=0.6)).verdict is Verdict.GOOD
     inverted = assess(replace(masked, area=0.9, start_area=0.15))
     assert inverted.verdict is Verdict.FAILED and inverted.nothing_there and "not inverted" in inverted.remedy
+    assert assess(replace(masked, start_area=0.0)).verdict is Verdict.GOOD
+    assert assess(replace(masked, start_area=0.0, area=0.0)).reason.startswith("No arm is in view")
     empty = assess(replace(masked, agreement=0.0, predicted=0.0))
     assert empty.verdict is Verdict.FAILED and empty.reason.startswith("The given mask is empty")
 
@@ -252,11 +254,16 @@ def test_small_arms_are_assessed_per_camera(shipped_psm: Robot, tiny_sequence: C
         T_world_base[1, :3, 3] += torch.from_numpy(camera.T_camera_world[:3, :3].T @ [1.0, 0.0, 2.7]).float()
         state = replace(scene.state({name: tiny.truth[0] for name in ("PSM1", "PSM2")}), T_world_base=T_world_base)
         share = float((Renderer(scene).segment(state) == 1).mean())
-        assert _SHOWN / 2 < share < _SHOWN
+        assert MIN_ARM_AREA / 2 < share < MIN_ARM_AREA
         predictor = _FirstArm(torch.zeros(2, 4, 240, 320))
         images = FrameImages.of(scene, {name: frame.images["left"] for name in names}, {}, SurfaceSolver(), predictor)
         alone = images.renderer.surface_maps(replace(state, T_world_base=torch.stack([T_world_base[0]] * 2)))
         found.append(evidence(images, state, state, _FirstArm(alone[:, COVERAGE]), 0.01))
+        # An arm of which so little is in view may leave the image.
+        gone = T_world_base.clone()
+        gone[1, :3, 3] += torch.from_numpy(camera.T_camera_world[:3, :3].T @ [9.0, 0.0, 0.0]).float()
+        left = evidence(images, state, replace(state, T_world_base=gone), _FirstArm(alone[:, COVERAGE]), 0.01)
+        assert left.still_in_view == 1.0
     one, two = found
     assert one.agreement > 0.8 and two.agreement == pytest.approx(one.agreement, abs=1e-3)
 
@@ -277,6 +284,16 @@ def test_a_sequence_is_as_good_as_most_of_its_frames(right: int, wrong: int, wan
     found = assess_sequence(verdicts(right, wrong))
     assert found.verdict is wanted and found.counts == {"good": right, "doubtful": 0, "failed": wrong}
     assert (sequence_hint("left", found) is None) == (wanted is Verdict.GOOD)
+
+
+def test_frames_without_arms_say_nothing_about_the_others() -> None:
+    absent = assess(replace(RIGHT, start_area=0.0, area=0.0))
+    found = assess_sequence([absent] * 8 + verdicts(4, 0))
+    assert found.verdict is Verdict.GOOD and found.counts == {"good": 4, "doubtful": 0, "failed": 8}
+    assert assess_sequence([absent] * 8 + verdicts(1, 3)).verdict is Verdict.FAILED
+    assert assess_sequence([absent] * 8).verdict is Verdict.FAILED
+    elsewhere = assess(replace(absent.evidence, elsewhere=0.1))
+    assert assess_sequence([elsewhere] * 8 + verdicts(4, 0)).verdict is Verdict.FAILED
 
 
 def test_the_verdict_on_a_sequence_names_the_reason_of_most_frames_and_what_to_try() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from carts_core.cli.options import SolverOptions
+from carts_core.cli.options import CalibrationOptions, SolverOptions
 from carts_core.errors import SettingsError
 from carts_core.settings import (
     DescentSolver,
@@ -79,6 +79,12 @@ def test_a_wrong_settings_file_is_told_in_words(text: str, message: str, tmp_pat
     path.write_text(text, encoding="utf-8")
     with pytest.raises(SettingsError, match=message):
         SolverOptions(settings=(str(path),))
+
+
+def test_settings_that_a_calibration_does_not_use_are_refused() -> None:
+    for text in ('free.locked_cameras=["left"]', "sequence.initial_frames=3"):
+        with pytest.raises(SettingsError, match=r"allowed: tables \[solver\]\."):
+            CalibrationOptions(settings=(text,))
 
 
 def test_a_solver_of_another_name_is_refused() -> None:

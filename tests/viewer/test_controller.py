@@ -35,8 +35,36 @@ def test_the_queue_keeps_the_newest_value_of_each_joint_and_every_press_in_order
     queue.put("one", intents.SetJoint("PSM1", 0, 100.0))
     assert queue.waits("one", intents.SetJoint("PSM1", 0, 0.0).key) and not queue.empty()
     moves = [intents.MoveFrame(1)] * 3
-    assert _taken(queue, 0) == [intents.SetJoint("PSM2", 0, 3.0), *moves, intents.SetJoint("PSM1", 0, 100.0)]
+    edits = [intents.SetJoint("PSM1", 0, 99.0), intents.SetJoint("PSM2", 0, 3.0)]
+    assert _taken(queue, 0) == [*edits, *moves, intents.SetJoint("PSM1", 0, 100.0)]
     assert _taken(queue, 0) == [] and queue.empty() and not queue.waits("one", intents.SetJoint("PSM1", 0, 0.0).key)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        (intents.Released(), intents.PointAt(9.0, 9.0), intents.Released()),
+        (intents.PointAt(1.0, 1.0), intents.Released(), intents.PointAt(9.0, 9.0), intents.Released()),
+        (intents.ShowFrame(5), intents.SetNote("blurred"), intents.ShowFrame(6), intents.SetNote("clear")),
+        (intents.ShowFrame(5), intents.SetReview("accepted"), intents.ShowFrame(6)),
+        (intents.SetJoint("PSM1", 0, 0.1), intents.Undo(), intents.SetJoint("PSM1", 0, 0.2)),
+    ],
+)
+def test_a_gesture_or_a_frame_is_never_joined_with_the_next_one(given: tuple[intents.Intent, ...]) -> None:
+    queue = IntentQueue[str]()
+    for intent in given:
+        queue.put("one", intent)
+        queue.put("one", intents.Drawn())
+        queue.put("two", intents.MoveFrame(1))
+    assert [queued.intent for queued in queue.take(0) if queued.tab == "one"] == [*given, intents.Drawn()]
+
+
+def test_frames_passed_by_a_scrub_are_left_out() -> None:
+    queue = IntentQueue[str]()
+    for index in range(9):
+        queue.put("one", intents.ShowFrame(index))
+        queue.put("one", intents.Drawn())
+    assert _taken(queue, 0) == [intents.ShowFrame(8), intents.Drawn()]
 
 
 def test_a_wait_for_the_queue_ends_with_a_put_from_another_thread_and_with_nothing_when_woken() -> None:

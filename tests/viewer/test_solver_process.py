@@ -85,6 +85,22 @@ def test_results_equal_those_of_the_solver_in_this_process(
         assert one == other
 
 
+@pytest.mark.parametrize("intent", [intents.Solve(whole=True), intents.OptimizeFrames("all")])
+def test_the_worker_rests_while_the_solver_works_on_a_job(
+    tiny_sequence: Callable[..., Path], solver: SolverProcess, tmp_path: Path, intent: intents.Intent
+) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=2))
+    factory = OptimizerFactory(report=lambda text: None, requests=solver, inference="torch")
+    with closing(Desk(sequence, Project.open(sequence, tmp_path / "project.carts"), factory)) as desk:
+        desk.do(intents.SetSetting("solver", "surface"), intent)
+        waits = []
+        while (wait := desk.wait_time()) is not None:
+            waits.append(wait)
+            time.sleep(min(wait, 0.002))
+            desk.advance()
+        assert desk.state.jobs[-1].state.value == "done" and max(waits) > 0
+
+
 def test_a_run_whose_process_is_killed_ends_at_its_last_iterate_and_can_be_started_again(
     tiny_sequence: Callable[..., Path], untrained_weights: Path
 ) -> None:
