@@ -66,8 +66,8 @@ class Information:
         Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
         it is about 1 for a consistent measurement, and 0 if no direction is measured.
         """
-        difference, spread = self._innovation(expected)
-        return float(difference @ np.linalg.solve(spread, difference)) / max(len(difference), 1)
+        squared, directions = self._distance(expected)
+        return squared / max(directions, 1)
 
     def log_likelihood(self, expected: Gaussian) -> float:
         """Log likelihood of the measured directions under a prediction, up to a constant [1]."""
@@ -84,16 +84,28 @@ class Information:
         spread = np.linalg.inv(L) + measured.T @ expected.covariance @ measured
         return np.linalg.solve(L, measured.T @ residual), spread
 
+    def _distance(self, expected: Gaussian) -> tuple[float, int]:
+        """Squared Mahalanobis distance from the prediction [1], and number of measured directions."""
+        difference, spread = self._innovation(expected)
+        return float(difference @ np.linalg.solve(spread, difference)), len(difference)
+
     def contradicts(self, expected: Gaussian, groups: Sequence[range]) -> bool:
-        """Whether the correction of a group of unknowns, such as an arm, deviates from its prediction by three standard
-        deviations or more, on average."""
-        return any(
-            own.mahalanobis(there) > _CONTRADICTS for own, there in (self.of(expected, group) for group in groups)
-        )
+        """Whether the correction of a group of unknowns, such as an arm, deviates significantly from its prediction.
+
+        The squared distance of a consistent measurement has a chi-square distribution with a degree of freedom per
+        measured direction, of which the cube root is nearly normal (Wilson and Hilferty, The distribution of
+        chi-square, 1931). The bound is three standard deviations of this normal distribution.
+        """
+        for own, there in (self.of(expected, group) for group in groups):
+            squared, directions = own._distance(there)
+            spread = 2.0 / (9.0 * max(directions, 1))
+            if squared > directions * (1.0 - spread + _SIGNIFICANT * math.sqrt(spread)) ** 3:
+                return True
+        return False
 
 
-_CONTRADICTS = 9.0
-"""Mean squared Mahalanobis distance at which a measurement contradicts its prediction [1]."""
+_SIGNIFICANT = 3.0
+"""Significant deviation, in standard deviations [1]."""
 
 _MEASURED = 10.0
 """Minimum precision of a measured direction [1/rad^2]: a standard deviation of 18 degrees."""

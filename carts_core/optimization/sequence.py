@@ -425,7 +425,7 @@ class SequenceOptimizer:
         elif blank:
             nothing = Information.nothing(len(variables))
             start, measurement = Origin.CARRIED, Measurement(expected.mean, nothing, loss=0.0, iterations=0)
-        elif self._begun and (found := self._tracker.measured(self._solver, frame, variables, expected)) is not None:
+        elif (found := self._without_network(frame, variables, expected)) is not None:
             start, measurement = Origin.WARM, found
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
@@ -449,21 +449,32 @@ class SequenceOptimizer:
         self._estimates = None
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 
+    def _without_network(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement | None:
+        """Measurement without the network; None if the network is needed, or the frame was solved individually."""
+        if not self._begun or frame.index in self._initial:
+            return None
+        return self._tracker.measured(self._solver, frame, variables, expected)
+
     def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
         """Measure a frame from a warm start, or from a cold start for the first frame or after an unusual loss; the
         last value is whether recovery failed."""
+        alone = self._initial.get(frame.index)
+        usual = self._unusual_loss()
+        if alone is not None:
+            # Where the error jumps, the frame fits much worse than it did individually.
+            usual = min(usual, self.model.cold_factor * alone.measurement.loss)
         if not self._begun:
             if self._initial_correction is None:
                 return Origin.COLD, self._solver.cold(frame, variables, self._prior), False
-            return Origin.COLD, self._solver.warm(frame, variables, self._prior, self._initial_correction), False
-        usual = self._unusual_loss()
+            first = self._solver.warm(frame, variables, self._prior, self._initial_correction)
+            return Origin.COLD, first if alone is None or first.loss <= usual else alone.measurement, False
         warm = self._solver.warm(frame, variables, expected, expected.mean)
         if warm.loss > usual:
             wide = self._solver.warm(frame, variables, expected, expected.mean, wide=True)
             warm = replace(min(warm, wide, key=lambda found: found.loss), iterations=warm.iterations + wide.iterations)
         if warm.loss <= usual or not (warm.information.any or self._is_in_view(frame, variables, expected)):
             return Origin.WARM, warm, False
-        cold = self._solver.cold(frame, variables, self._prior)
+        cold = self._solver.cold(frame, variables, self._prior) if alone is None else alone.measurement
         best = min(warm, cold, key=lambda measurement: measurement.loss)
         best = replace(best, iterations=warm.iterations + cold.iterations)
         lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss

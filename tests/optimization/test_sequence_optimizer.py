@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,10 +13,12 @@ from perfect_predictor import PerfectPredictor
 from short_sequence import ALONE, ARM, FRAMES, Truths, optimizer
 
 from carts_core.errors import RobotError, SequenceError, SettingsError
+from carts_core.networks import FeatureExtractor
 from carts_core.optimization import (
     DescentSolver,
     FrameOptimizer,
     FreeParameters,
+    NetworkPredictor,
     SequenceOptimizer,
     SequenceSettings,
     SurfaceSolver,
@@ -24,7 +27,7 @@ from carts_core.optimization import (
 from carts_core.optimization.sequence import Keyframes, initial_correction
 from carts_core.optimization.sequence_frame import FrameEstimate, Origin, SequenceFrameSolver
 from carts_core.optimization.variables import Variables
-from carts_core.recording import Frame
+from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 
 WRIST_PITCH = 4
@@ -280,6 +283,28 @@ def test_a_jump_of_the_error_begins_anew(truths: Truths) -> None:
     for index, estimate in sequence.estimates.items():
         # Of 3 degrees, the last half degree is held back by what is expected of a constant.
         assert error(truths, index, estimate.joint_positions)[:2].max() < np.deg2rad(0.6)
+
+
+@pytest.mark.slow
+def test_a_jump_of_one_of_two_arms_is_found_with_the_shipped_network(sample_sequence_path: Path) -> None:
+    sequence = Sequence.open(sample_sequence_path)
+    scene, rng = sequence.scene.with_cameras(["left"]), np.random.default_rng(5)
+    first, *others = (arm.name for arm in scene.arms)
+    wrong = {name: np.deg2rad(rng.choice([-1.5, 1.5], 7)) * [1, 1, 0.05, 1, 1, 1, 1] for name in (first, *others)}
+    jump = {first: np.deg2rad([2.0, -2.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
+
+    def load(index: int) -> Frame:
+        frame = sequence.frame(index, "regular", ["left"])
+        truth = frame.truth or {}
+        measured = {name: truth[name] + wrong[name] + (index >= 12) * jump.get(name, 0.0) for name in truth}
+        return replace(frame, measured=measured)
+
+    times = {index: index / 25 for index in range(24)}
+    optimizer = SequenceOptimizer(scene, load, times, NetworkPredictor(FeatureExtractor.load()))
+    list(optimizer)
+    for index, estimate in optimizer.estimates.items():
+        truth = load(index).truth or {}
+        assert np.abs(estimate.joint_positions[first] - truth[first])[:2].mean() < np.deg2rad(0.4)
 
 
 def test_locked_joints_stay_measured_and_have_no_deviation(truths: Truths) -> None:
