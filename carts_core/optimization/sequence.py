@@ -450,8 +450,10 @@ class SequenceOptimizer:
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 
     def _without_network(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement | None:
-        """Measurement without the network; None if the network is needed, or the frame was solved individually."""
-        if not self._begun or frame.index in self._initial:
+        """Measurement without the network; None if the network is needed, as where the error jumps."""
+        alone = self._initial.get(frame.index)
+        jumps = alone is not None and alone.measurement.information.contradicts(expected, variables.groups)
+        if jumps or not self._begun:
             return None
         return self._tracker.measured(self._solver, frame, variables, expected)
 

@@ -265,7 +265,8 @@ def test_a_recording_that_begins_before_the_arm_is_in_view(truths: Truths) -> No
     for index in set(range(FRAMES)) - absent:
         assert error(truths, index, estimates[index].joint_positions)[:2].max() < np.deg2rad(0.3)
     for index in absent:
-        assert estimates[index].assessment is not None and estimates[index].assessment.nothing_there
+        found = estimates[index].assessment
+        assert found is not None and found.nothing_there
     assert sequence.assessment is not None and sequence.assessment.counts["good"] == FRAMES - len(absent)
 
 

@@ -13,6 +13,7 @@ from viewer_tab import decoded
 from carts_core.errors import CartsError, SettingsError
 from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.project import Source
+from carts_core.project.values import ReviewState
 from carts_viewer import actions, controller
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Handler
@@ -46,7 +47,7 @@ def test_the_queue_keeps_the_newest_value_of_each_joint_and_every_press_in_order
         (intents.Released(), intents.PointAt(9.0, 9.0), intents.Released()),
         (intents.PointAt(1.0, 1.0), intents.Released(), intents.PointAt(9.0, 9.0), intents.Released()),
         (intents.ShowFrame(5), intents.SetNote("blurred"), intents.ShowFrame(6), intents.SetNote("clear")),
-        (intents.ShowFrame(5), intents.SetReview("accepted"), intents.ShowFrame(6)),
+        (intents.ShowFrame(5), intents.SetReview(ReviewState.ACCEPTED), intents.ShowFrame(6)),
         (intents.SetJoint("PSM1", 0, 0.1), intents.Undo(), intents.SetJoint("PSM1", 0, 0.2)),
     ],
 )
