@@ -171,6 +171,15 @@ class Target:
         there = recording.frame(index, domain, own).masks or {}
         return [name for name in own if name in there]
 
+    def covers(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> bool:
+        """Whether a frame has an image and, if only masks are fitted, a mask of each of its images."""
+        shown = [name for name in cameras if recording.with_image([index], [name])]
+        if self.observed.what != "masks":
+            return bool(shown)
+        if self.given is not None:
+            return bool(shown) and all(self.given.available(index, name) for name in shown)
+        return bool(shown) and all(recording.has_masks(name, domain, index) for name in shown)
+
 
 NETWORK = Target()
 """The network's predictions as target."""

@@ -116,8 +116,8 @@ class UnknownChange:
     """Unit of all other fields: deg, mm, px or %."""
     change: float
     standard_deviation: float
-    """Standard deviation from all modelled errors: frame errors, a common outline error, fixed intrinsics, and early
-    termination of the optimization.
+    """Standard deviation from all modelled errors: frame errors, a common outline error, fixed intrinsics, early
+    termination of the optimization, and the prior, which alone determines what the images do not show.
     """
     deviation: float
     """Standard deviation from the curvature alone, for independent pixels."""
@@ -260,7 +260,10 @@ class CalibrationOptimizer:
         if last is None or problem.present is None:
             return
         start = torch.zeros_like(last.offsets)
-        before, after = problem.evidence(start), problem.evidence(last.offsets)
+        pairs = list(zip(problem.evidence(start), problem.evidence(last.offsets), strict=True))
+        # Frames without an arm say nothing about the calibration, unless no frame shows an arm.
+        pairs = [pair for pair in pairs if not all(one.without_arms for one in pair)] or pairs
+        before, after = zip(*pairs, strict=True)
         self.assessment = self._with_knowledge(assess_calibration(after))
         if not bool(last.offsets.any()):
             return
@@ -330,10 +333,8 @@ class CalibrationOptimizer:
         if not self.free.intrinsics:
             shifts.append(_INTRINSICS_ERROR * alone @ self._problem.curvature_with_intrinsics(offsets))
         together = torch.cat(shifts, 1)
-        shared = together @ together.T
-        if self._known:
-            # The jackknife does not include the error of known base frames.
-            shared = shared + alone @ self._problem.prior.precision.double().cpu() @ alone
+        # The error of the prior, from which directions that the images do not determine get all of their deviation.
+        shared = together @ together.T + alone @ self._problem.prior.precision.double().cpu() @ alone
         # With a single frame, the correlation of pixels is taken from the settings.
         frames = _CORRELATED**2 * alone if between is None else between
         total = frames + shared

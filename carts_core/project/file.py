@@ -11,6 +11,7 @@ import ctypes
 import errno
 import fcntl
 import os
+import shutil
 import socket
 import sqlite3
 import stat
@@ -381,6 +382,9 @@ class ProjectFile:
                 raise ProjectError(f"project {self.path} cannot be opened for writing. Open it read-only.")
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA wal_autocheckpoint = 0")
+            page_size = connection.execute("PRAGMA page_size").fetchone()[0]
+            # A larger project could not be opened again.
+            connection.execute(f"PRAGMA max_page_count = {(LARGEST - MAX_LOG_BYTES) // page_size}")
             # Logs start empty; see `_recovered`.
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             database.migrate(connection, nonce)
@@ -409,10 +413,19 @@ class ProjectFile:
                 raise LostFile("was damaged") from error
             # The log may have grown by an incomplete transaction.
             self._remember()
+            if getattr(error.__cause__, "sqlite_errorname", "") == "SQLITE_FULL" and self._has_room():
+                raise ProjectError(
+                    f"project {self.path} has reached the limit of {(LARGEST - MAX_LOG_BYTES) // 2**20} MiB. This "
+                    "change was not saved; earlier changes are safe. Continue in a new project (--project FILE)."
+                ) from error
             raise
         self._check_since(committed=True)
         self._seal = seal
         self._remember()
+
+    def _has_room(self) -> bool:
+        """Whether the disk has space for twice the largest log of usual size."""
+        return shutil.disk_usage(self.path.parent).free > 2 * MAX_LOG_BYTES
 
     def checkpoint(self) -> None:
         """Checkpoint a large log into the file, and verify the file; `LostFile` if the content differs."""

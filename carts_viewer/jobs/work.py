@@ -99,12 +99,19 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     session, state = context.session, context.state
     sequence = session.sequence
     cameras = [camera.name for camera in session.scene.cameras]
-    indices = evenly_spaced(len(sequence), min(count, len(sequence)))
+    target = session.target(state.observed)
+    usable = [index for index in range(len(sequence)) if target.covers(sequence, index, state.domain, cameras)]
+    if not usable:
+        raise CartsError(
+            f"No frame has masks of all cameras ({', '.join(cameras)}) to calibrate with. Paint or import masks, or "
+            "choose another target."
+        )
+    indices = [usable[place] for place in evenly_spaced(len(usable), min(count, len(usable)))]
     free = replace(
         state.free, base_frames=state.free.base_frames or not (state.free.extrinsics or state.free.intrinsics)
     )
     yield Progress(0, 0, f"Reading {len(indices)} frames")
-    target, before = session.target(state.observed), session.editor.view
+    before = session.editor.view
     measured = session.measured(state.frame)
     ignored = tuple(session.ignored(index, cameras, target) for index in indices)
     scene = scene_at(session.scene, measured)

@@ -375,12 +375,13 @@ class HandEyeStep:
         scene, known = self._clicking.scene, self._clicking.result.base_covariances
         unknown = unknown_cameras(self._sequence.scene)
         fixed = tuple(camera.name for camera in scene.cameras if camera.name not in unknown)
+        usable = self._sequence.with_image(range(len(self._sequence)), [camera.name for camera in scene.cameras])
         task = CalibrationTask(
             self._sequence,
-            tuple(evenly_spaced(len(self._sequence), CALIBRATION_FRAMES)),
+            tuple(usable[place] for place in evenly_spaced(len(usable), min(len(usable), CALIBRATION_FRAMES))),
             self._sequence.domains[0],
             Calibration.of(scene),
-            replace(CALIBRATION, locked_cameras=fixed),
+            replace(CALIBRATION, arms=tuple(known), locked_cameras=fixed),
             NETWORK,
             backgrounds=False,
             known_base_frames=known,

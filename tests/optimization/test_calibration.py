@@ -112,6 +112,24 @@ def test_base_frame_and_camera_are_found(sequence: Sequence, frames: list[Frame]
         assert distance < 4 * np.hypot(deviation.sideways_mm, deviation.depth_mm) < 40
 
 
+def test_an_arm_that_is_never_in_view_has_the_deviations_of_the_prior(
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
+) -> None:
+    arm = sequence.scene.arms[0]
+    parked = replace(arm, name="PSM2", T_world_base=rigid([0.0, 0.0, 0.0], [5000.0, 0.0, 0.0]) @ arm.T_world_base)
+    wrong = with_wrong_base(sequence.scene)
+    scene = replace(wrong, arms=(*wrong.arms, parked))
+    both = [replace(frame, measured={**frame.measured, "PSM2": frame.measured["PSM1"]}) for frame in frames]
+    optimizer = CalibrationOptimizer(scene, both, predictor, settings=SETTINGS, free=FreeParameters(base_frames=True))
+    list(optimizer)
+    result = optimizer.result()
+    for unknown in result.unknowns:
+        assert np.isfinite(unknown.standard_deviation)
+        if unknown.name.startswith("PSM2/base"):
+            assert unknown.standard_deviation >= 0.99 * unknown.prior_deviation
+    assert all(np.isfinite(astuple(deviation)).all() for deviation in result.deviations.values())
+
+
 def test_failed_calibrations_keep_the_start(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     wrong = with_wrong_base(sequence.scene)
     right = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)

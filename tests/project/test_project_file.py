@@ -23,6 +23,7 @@ from carts_core.project import (
     ReviewState,
     database,
     default_path,
+    file,
 )
 from carts_core.project.layers import Layer
 from carts_core.recording import Sequence
@@ -69,6 +70,22 @@ def test_the_file_can_be_read_with_plain_sql(project: Project, project_path: Pat
     assert rows(project_path, "SELECT json_extract(value, '$.state') FROM current WHERE kind = 'review'") == [
         ("accepted",)
     ]
+
+
+def test_a_project_at_its_limit_refuses_edits_and_opens_again(
+    project_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(file, "LARGEST", file.MAX_LOG_BYTES + 400_000)
+    saved = 0
+    with Project(IDENTITY, project_path) as project:
+        with pytest.raises(ProjectError, match=r"has reached the limit of .* Continue in a new project"):
+            while saved < 100:
+                project.apply("Note", {Key.review(0): Review(note=f"{saved}" + 9_000 * "x")})
+                saved += 1
+        assert project.writable and len(project.state.steps) == saved
+    assert 10 < saved < 100 and project_path.stat().st_size <= 400_000
+    with Project(IDENTITY, project_path) as project:
+        assert project.writable and project.state.review(0).note.startswith(f"{saved - 1}x")
 
 
 def test_a_second_process_opens_read_only_and_says_so_until_the_first_is_killed(project_path: Path) -> None:

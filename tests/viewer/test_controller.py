@@ -55,17 +55,17 @@ def test_a_gesture_or_a_frame_is_never_joined_with_the_next_one(given: tuple[int
     queue = IntentQueue[str]()
     for intent in given:
         queue.put("one", intent)
-        queue.put("one", intents.Drawn())
+        queue.put("one", intents.Drawn(0))
         queue.put("two", intents.MoveFrame(1))
-    assert [queued.intent for queued in queue.take(0) if queued.tab == "one"] == [*given, intents.Drawn()]
+    assert [queued.intent for queued in queue.take(0) if queued.tab == "one"] == [*given, intents.Drawn(0)]
 
 
 def test_frames_passed_by_a_scrub_are_left_out() -> None:
     queue = IntentQueue[str]()
     for index in range(9):
         queue.put("one", intents.ShowFrame(index))
-        queue.put("one", intents.Drawn())
-    assert _taken(queue, 0) == [intents.ShowFrame(8), intents.Drawn()]
+        queue.put("one", intents.Drawn(0))
+    assert _taken(queue, 0) == [intents.ShowFrame(8), intents.Drawn(0)]
 
 
 def test_a_wait_for_the_queue_ends_with_a_put_from_another_thread_and_with_nothing_when_woken() -> None:

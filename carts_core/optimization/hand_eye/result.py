@@ -314,7 +314,9 @@ def agreement_with_points(
         after[list(view.rows)] = np.linalg.norm(residuals, axis=-1)
         freedom[list(view.rows)] += view.is_point
     variance = found.noise**2 + _variance_of_joints(scene, measured, points) / freedom
-    counted = np.setdiff1d(np.flatnonzero(np.isfinite(found.distances)), found.contradicting)
+    there = np.flatnonzero(np.isfinite(found.distances))
+    counted = np.setdiff1d(there, found.contradicting)
+    counted = counted if len(counted) else there
     limits = np.full(len(points), np.inf)
     limits[counted] = np.sqrt(variance[counted] * chdtri(freedom[counted], _LEVEL / len(counted)))
     degrees = freedom[counted].sum()
