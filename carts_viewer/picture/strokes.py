@@ -1,5 +1,6 @@
 """Strokes over a frame: tools, parsing of strokes from a browser, and their effect on painted layers."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -89,17 +90,20 @@ class Stroke:
 
     def covers(self, camera: Camera) -> Mask:
         """The pixels of the camera's image that the stroke covers."""
-        covered = np.zeros((camera.height, camera.width), bool)
-        margin = self.diameter / 2 + 1
-        limits = (camera.width, camera.height)
-        left, top = np.clip(np.floor(self.points.min(0) - margin), 0, limits).astype(int)
-        right, bottom = np.clip(np.ceil(self.points.max(0) + margin), 0, limits).astype(int)
+        margin = math.ceil(self.diameter / 2) + 1
+        # Lines just outside of the image also cover its pixels, so the canvas has a margin on each side.
+        limits = (camera.width + 2 * margin, camera.height + 2 * margin)
+        covered = np.zeros(limits[::-1], bool)
+        image = covered[margin:-margin, margin:-margin]
+        drawn = self.points + margin
+        left, top = np.clip(np.floor(drawn.min(0) - margin), 0, limits).astype(int)
+        right, bottom = np.clip(np.ceil(drawn.max(0) + margin), 0, limits).astype(int)
         if right <= left or bottom <= top:
-            return covered
+            return image
         # Thin lines on subpixels and their distances, since OpenCV rounds thick lines to whole pixels.
         canvas = np.ones((_SUBPIXELS * (bottom - top), _SUBPIXELS * (right - left)), np.uint8)
         # OpenCV places integer coordinates at pixel centres, this package at pixel corners.
-        points = _SUBPIXELS * (self.points - (left, top)) - 0.5
+        points = _SUBPIXELS * (drawn - (left, top)) - 0.5
         line = np.rint(points * 2**_FRACTION_BITS).astype(np.int32)
         if self.polygon:
             cv2.fillPoly(canvas, [line], 0, cv2.LINE_8, _FRACTION_BITS)
@@ -110,7 +114,7 @@ class Stroke:
             inside = distance <= _SUBPIXELS * self.diameter / 2
         middle = slice(_SUBPIXELS // 2, None, _SUBPIXELS)
         covered[top:bottom, left:right] = inside[middle, middle]
-        return covered
+        return image
 
 
 class Painted(Event):

@@ -73,6 +73,16 @@ def test_a_stroke_covers_the_pixels_within_its_radius_or_a_filled_polygon() -> N
     assert covered[11:39, 11:49].all() and covered.sum() <= 41 * 31
 
 
+@pytest.mark.parametrize("start", [(-4.0, -10.0), (68.0, -10.0), (-10.0, -5.0), (-10.0, 53.0)])
+def test_a_stroke_beside_the_image_covers_the_border_within_its_radius(start: tuple[float, float]) -> None:
+    end = (start[0], 60.0) if start[1] == -10.0 else (80.0, start[1])
+    covered = _read(points=[start, end], diameter=15).covers(CAMERA)
+    y, x = np.mgrid[:48, :64] + 0.5
+    distance = np.abs(x - start[0]) if end[0] == start[0] else np.abs(y - start[1])
+    assert covered.shape == (48, 64) and (distance < 7.25).any()
+    assert covered[distance < 7.25].all() and not covered[distance > 7.75].any()
+
+
 def test_points_far_outside_and_brushes_too_thick_are_clamped() -> None:
     stroke = _read(points=[[-1e9, 20], [1e300, 20]], diameter=1e9)
     assert stroke.points.tolist() == [[-64, 20], [128, 20]] and stroke.diameter == 300
