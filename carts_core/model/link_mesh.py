@@ -64,9 +64,10 @@ class Decimation:
 def mesh_path(urdf_folder: Path, name: str) -> Path:
     """Path of the file of a `<mesh filename=...>`, which need not exist.
 
-    `package://NAME/REST` is resolved as in ROS packages: `REST` in the folder of the URDF or one of its parents
-    (`NAME/urdf` beside `NAME/meshes`), or in a folder `NAME` in one of these. `file://` and plain paths are used
-    directly, relative to the folder of the URDF.
+    `package://NAME/REST` is resolved as in ROS packages: `REST` in a folder `NAME` that is the folder of the URDF or
+    one of its parents (`NAME/urdf` beside `NAME/meshes`), or lies in one of these. Without such a file, it is `REST` in
+    the folder of the URDF or one of its parents, whatever its name. `file://` and plain paths are used directly,
+    relative to the folder of the URDF.
     """
     scheme, mark, rest = name.partition("://")
     if not mark:
@@ -74,12 +75,17 @@ def mesh_path(urdf_folder: Path, name: str) -> Path:
     if scheme == "package":
         package, _, inside = rest.partition("/")
         folder = urdf_folder.resolve()
-        for parent in (folder, *folder.parents[:_PACKAGE_LEVELS]):
-            for candidate in (parent / inside, parent / package / inside):
-                if is_regular(candidate):
-                    return candidate
-        return folder / inside
+        parents = (folder, *folder.parents[:_PACKAGE_LEVELS])
+        named = [each for parent in parents for each in _in_package(parent, package)]
+        any_name = [each for parent in parents for each in (parent, parent / package)]
+        found = (each / inside for each in (*named, *any_name) if is_regular(each / inside))
+        return next(found, folder / inside)
     return urdf_folder / (unquote(urlsplit(name).path) if scheme == "file" else rest)
+
+
+def _in_package(parent: Path, package: str) -> list[Path]:
+    """Folders of a package, given a parent folder of the URDF."""
+    return [parent / package, *([parent] if parent.name == package else [])]
 
 
 def collada_asset(path: Path) -> tuple[float, str]:

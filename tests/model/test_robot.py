@@ -12,6 +12,7 @@ import yourdfpy
 from carts_core.decoders.meshes import MAX_FACES
 from carts_core.errors import RobotError
 from carts_core.model.decimation import deviation
+from carts_core.model.link_mesh import mesh_path
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.robot import Robot
 from carts_core.resources import shipped_robot
@@ -280,6 +281,19 @@ def test_collada_units_are_applied_and_up_axes_reported(tmp_path: Path, metres: 
     said = " ".join(robot.remarks)
     assert ("scaled by the unit of the COLLADA file" in said) == (unit != "m")
     assert (f"up axis {axis} of the COLLADA file is ignored" in said) == (axis == "Y_UP")
+
+
+def test_a_mesh_of_another_package_is_not_loaded(tmp_path: Path) -> None:
+    inside = "meshes/visual/base.stl"
+    mine, other = tmp_path / "share/ur_description" / inside, tmp_path / "share/mount_description" / inside
+    urdf = tmp_path / "share/mount_description/urdf"
+    for path in (mine, other, urdf / "x"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+    assert mesh_path(urdf, f"package://ur_description/{inside}") == mine
+    assert mesh_path(urdf, f"package://mount_description/{inside}") == other
+    # A package that was renamed is found as before.
+    assert mesh_path(urdf, f"package://unknown/{inside}") == other
 
 
 def screws(count: int, sections: int) -> trimesh.Trimesh:
