@@ -14,6 +14,9 @@ from ..reprs import short_repr
 CLUSTERING_RATIO = 10
 """Ratio of triangles to the requested number above which meshes are first clustered [1]."""
 
+OPAQUE = 0.99
+"""Minimum alpha of rendered visuals [1]."""
+
 _HEAD = 2**16
 """Number of bytes at the start of a COLLADA file that are searched for its unit and up axis."""
 _UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)\s*[\"']")

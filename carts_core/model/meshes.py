@@ -16,7 +16,7 @@ from ..files.decoding import Limits, called
 from ..files.reading import is_regular
 from ..wording import shown
 from .decimation import DecimationError, decimated
-from .link_mesh import CLUSTERING_RATIO, Decimation, LinkMesh, collada_asset, mesh_path
+from .link_mesh import CLUSTERING_RATIO, OPAQUE, Decimation, LinkMesh, collada_asset, mesh_path
 
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
 FARTHEST = 100.0
@@ -85,7 +85,6 @@ SHARP_EDGE = np.deg2rad(38.0)
 """Maximum angle between faces that share a smooth normal [rad]."""
 
 _DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
-_OPAQUE = 0.99
 _AT_ONCE = 4
 """Maximum number of meshes that are decimated concurrently; each may take much memory."""
 _CLUSTERED = CLUSTERING_RATIO / 2
@@ -118,7 +117,7 @@ def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[
         RobotError: a mesh file is missing or cannot be read.
     """
     color, opacity = _urdf_color(visual, materials)
-    if opacity < _OPAQUE or visual.geometry is None:
+    if opacity < OPAQUE or visual.geometry is None:
         return []
     parts: list[tuple[trimesh.Trimesh, np.ndarray]] = []
     for mesh, own in _geometry(visual.geometry, folder):

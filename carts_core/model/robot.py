@@ -21,7 +21,7 @@ from ..reprs import short_repr
 from ..wording import listed, shown
 from . import mesh_cache
 from .instruments import robot_file
-from .link_mesh import CLUSTERING_RATIO, Decimation, LinkMesh, collada_asset, mesh_path
+from .link_mesh import CLUSTERING_RATIO, OPAQUE, Decimation, LinkMesh, collada_asset, mesh_path
 
 if TYPE_CHECKING:
     import trimesh
@@ -486,7 +486,7 @@ class Robot:
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
         decimation: summary of the decimation of the meshes.
         remarks: sentences on changes to meshes (scaling by the file's unit, vertex clustering, which may exceed the
-            tolerance), and on ignored up axes.
+            tolerance), on ignored up axes, and on omitted translucent visuals.
     """
 
     def __init__(
@@ -570,7 +570,7 @@ class Robot:
         )
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh to render. Add <visual> elements.")
-        remarks = _remarks(files)
+        remarks = (*_remarks(files), *_translucent(root))
         if decimation.before > CLUSTERING_RATIO * max_faces:
             remarks = (*remarks, f"{decimation}.")
         return Robot(name, urdf, kinematics, link_names, meshes, decimation, remarks)
@@ -645,6 +645,23 @@ def _remarks(files: Iterable[Path]) -> tuple[str, ...]:
             )
             found.setdefault(text, []).append(file.name)
     return tuple(f"{listed(names, 3)}: {text}." for text, names in found.items())
+
+
+def _translucent(root: Element) -> tuple[str, ...]:
+    """Remark on links with visuals that are omitted since they are translucent."""
+    materials = {material.get("name"): material for material in root.findall("material")}
+
+    def omitted(visual: Element) -> bool:
+        material = visual.find("material")
+        if material is not None and material.find("color") is None:
+            material = materials.get(material.get("name"))
+        color = None if material is None else material.find("color")
+        return color is not None and float(color.get("rgba", "1 1 1 1").split()[3]) < OPAQUE
+
+    names = [link.get("name", "") for link in root.findall("link") if any(map(omitted, link.findall("visual")))]
+    if not names:
+        return ()
+    return (f"{listed(names, 3)}: visuals with an alpha below {OPAQUE:g} are omitted. Set it to 1 to render them.",)
 
 
 def _prepared_meshes(

@@ -283,6 +283,24 @@ def test_collada_units_are_applied_and_up_axes_reported(tmp_path: Path, metres: 
     assert (f"up axis {axis} of the COLLADA file is ignored" in said) == (axis == "Y_UP")
 
 
+TRANSLUCENT = """<robot name="r"><material name="glass"><color rgba="1 0 0 0.5"/></material>
+<link name="base"><visual><geometry><sphere radius="0.01"/></geometry></visual>
+<visual><geometry><sphere radius="0.05"/></geometry><material name="glass"/></visual></link>
+<link name="tip"><visual><geometry><sphere radius="0.01"/></geometry><material name=""><color rgba="1 0 0 ALPHA"/>
+</material></visual></link><joint name="j" type="revolute"><parent link="base"/><child link="tip"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(("alpha", "named"), [("0.4", "base, tip: "), ("1", "base: ")])
+def test_links_with_omitted_translucent_visuals_are_named(tmp_path: Path, alpha: str, named: str) -> None:
+    (tmp_path / "robot.urdf").write_text(TRANSLUCENT.replace("ALPHA", alpha))
+    for _ in range(2):  # The second robot is read from the cache.
+        robot = Robot.load(tmp_path / "robot.urdf")
+        assert {robot.link_names[mesh.link] for mesh in robot.meshes} == ({"base"} if alpha != "1" else {"base", "tip"})
+        (remark,) = robot.remarks
+        assert remark.startswith(f"{named}visuals with an alpha below 0.99 are omitted.")
+
+
 def test_a_mesh_of_another_package_is_not_loaded(tmp_path: Path) -> None:
     inside = "meshes/visual/base.stl"
     mine, other = tmp_path / "share/ur_description" / inside, tmp_path / "share/mount_description" / inside
