@@ -41,6 +41,10 @@ CENTRE_RANGE = 0.25, 0.75
 SQUARE_RANGE = 0.9, 1.1
 """Plausible ratios fx / fy [1]; pixels are nearly square."""
 
+UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+"""Termination criteria for the undistortion of points: iterations and residual [px]. The default of OpenCV, 5
+iterations, leaves several pixels in the corners of images with strong distortion."""
+
 FARTHEST = 1e6
 """Maximum coordinate of a transform [m], focal length and principal point [px]."""
 
@@ -243,6 +247,12 @@ class Camera:
             return cv2.remap(image.astype(np.uint8), *maps, cv2.INTER_NEAREST).astype(bool)
         return cv2.remap(image, *maps, interpolation)
 
+    def undistort_points(self, points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+        """Positions in the undistorted image of points (u, v) of the recorded image [px], pixel centres at +0.5."""
+        if not any(self.distortion) or not len(points):
+            return points
+        return _undistorted(points - HALF_PIXEL, self.intrinsics, self.distortion) + HALF_PIXEL
+
     def distorted_mask(self, mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
         """Mask of a recorded image, from a mask of the undistorted image; the inverse of `undistort` up to rounding."""
         if not any(self.distortion):
@@ -271,11 +281,22 @@ def _distortion_maps(
     width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in the undistorted image of each pixel of a recorded image."""
-    K = opencv_matrix(intrinsics)
     rows, columns = np.mgrid[0:height, 0:width]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
-    found = cv2.undistortPoints(pixels[:, None], K, np.array(distortion), P=K).reshape(height, width, 2)
+    found = _undistorted(pixels, intrinsics, distortion).reshape(height, width, 2)
     return found[..., 0].astype(np.float32), found[..., 1].astype(np.float32)
+
+
+def _undistorted(
+    points: Float[np.ndarray, "points 2"], intrinsics: tuple[float, ...], distortion: tuple[float, ...]
+) -> Float[np.ndarray, "points 2"]:
+    """Undistorted positions of points [px], pixel centres at integers."""
+    K, values = opencv_matrix(intrinsics), np.array(distortion)
+    # OpenCV 5 replaces this function by an argument of `undistortPoints`.
+    iterate = getattr(cv2, "undistortPointsIter", None)
+    if iterate is not None:
+        return iterate(points[:, None], K, values, np.eye(3), K, UNDISTORTION)[:, 0]
+    return cv2.undistortPoints(points[:, None], K, values, P=K, criteria=UNDISTORTION)[:, 0]
 
 
 def opencv_matrix(intrinsics: Iterable[float]) -> Float[np.ndarray, "3 3"]:

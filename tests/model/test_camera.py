@@ -99,6 +99,18 @@ def test_a_mask_returns_to_the_recorded_image():
     assert camera().distorted_mask(recorded) is recorded
 
 
+@pytest.mark.parametrize("distortion", [BARREL, (-0.45, 0.2, 0.0, 0.0)])
+def test_undistorted_points_are_distorted_to_the_same_points(distortion):
+    distorted = camera(distortion=distortion, width=640, height=480, intrinsics=(400.0, 400.0, 320.0, 240.0))
+    x, y = np.meshgrid(np.linspace(0.0, 640.0, 9), np.linspace(0.0, 480.0, 7))
+    points = np.column_stack([x.ravel(), y.ravel()])
+    rays = np.column_stack([(distorted.undistort_points(points) - distorted.K[:2, 2]) / 400.0, np.ones(len(points))])
+    back, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), distorted.K, np.array(distortion))
+    assert np.abs(back[:, 0] - points).max() < 1e-3
+    plain = camera()
+    assert plain.undistort_points(points) is points
+
+
 def test_intrinsics_of_both_pixel_conventions_are_converted_to_centres_at_one_half():
     K = np.array([[110.0, 0.0, 63.0], [0.0, 115.0, 46.0], [0.0, 0.0, 1.0]])
     assert pinhole_intrinsics(K, 0.0) == (110.0, 115.0, 63.5, 46.5)

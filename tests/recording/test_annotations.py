@@ -334,3 +334,18 @@ def test_what_was_marked_in_images_with_distortion_is_undistorted(tiny_sequence:
     spot[60, 20] = 1.0
     rows, columns = np.nonzero(camera.undistort(cv2.GaussianBlur(spot, (0, 0), 1.0)) > 0.05)
     assert abs(columns.mean() + 0.5 - u) < 0.6 and abs(rows.mean() + 0.5 - v) < 0.6
+
+
+def test_points_in_corners_of_strongly_distorted_images_are_undistorted(
+    tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    lens = [-0.9, 0.6, 0.0, 0.0]
+    path = tiny_sequence(masks=False, edit=lambda text: text + f"distortion = {lens}\n")
+    sequence = Sequence.open(path)
+    camera: Camera = sequence.recorded_camera("left")
+    points = tmp_path / "keypoints_left.yaml"
+    points.write_text("1: {1: [1, 2]}\n")
+    found = np.array(all_of(points, sequence)[0][0, "left"].keypoints["1"])
+    ray = np.append((found - camera.K[:2, 2]) / camera.K[0, 0], 1.0)
+    back, _ = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), camera.K_opencv, np.array(lens))
+    np.testing.assert_allclose(back.ravel(), (1, 2), atol=1e-3)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ...errors import SequenceError
-from ...model.camera import HALF_PIXEL, Camera
+from ...model.camera import Camera
 from ..importing.cameras import side_of
 from ..sequence import Sequence
 from .images import BACKGROUND, MAX_LABELS, Annotations, ForeignImage, FrameAnnotation
@@ -175,7 +175,5 @@ def _check_size(name: str, size: tuple[int, ...], camera: Camera) -> None:
 def _undistorted(points: dict[str, tuple[float, float]], camera: Camera) -> dict[str, tuple[float, float]]:
     if not points or not any(camera.distortion):
         return points
-    K = camera.K_opencv
-    recorded = np.array(list(points.values()), np.float64) - HALF_PIXEL
-    straight = cv2.undistortPoints(recorded[:, None], K, np.array(camera.distortion), P=K)[:, 0] + HALF_PIXEL
+    straight = camera.undistort_points(np.array(list(points.values()), np.float64))
     return {name: (float(u), float(v)) for name, (u, v) in zip(points, straight, strict=True)}
