@@ -8,7 +8,7 @@ import torch
 
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
-from carts_core.model.scene import Arm, Scene
+from carts_core.model.scene import Arm, Scene, SceneState
 from carts_core.rendering import Renderer
 
 FOCAL_PER_WIDTH = 1.2
@@ -59,6 +59,17 @@ def tiny_scene(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, 
     signs = np.where(np.arange(len(robot.joint_names)) % 2, -1.0, 1.0)
     measured = truth + signs * np.where(prismatic, 0.1 * BIAS, BIAS)
     return TinyScene(Scene((Arm("PSM1", robot, np.eye(4)),), tuple(views)), truth, measured)
+
+
+def recorded_mask(scene: Scene, state: SceneState, camera: Camera) -> np.ndarray:
+    """Mask of the arms in the recorded image of a camera with distortion, looked up in a rendering of three times its
+    width and height."""
+    width, height = camera.width, camera.height
+    around = (-width, -height, 3 * width, 3 * height)
+    arms = Renderer(scene, cameras=[camera.name], window=around).segment(state)[0] >= 0
+    y, x = np.mgrid[:height, :width] + 0.5
+    u, v = np.floor(camera.undistort_points(np.column_stack([x.ravel(), y.ravel()]))).astype(int).T
+    return arms[v + height, u + width].reshape(height, width)
 
 
 @dataclass(frozen=True)

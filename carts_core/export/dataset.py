@@ -362,6 +362,31 @@ class Dataset:
             if mask.any():
                 yield category, mask
 
+    def recorded_mask(self, view: View) -> Bool[np.ndarray, "height width"]:
+        """Mask of all arms in the recorded image of a view, which is not undistorted.
+
+        With distortion, the recorded image may show more than the undistorted image. There, the mask is rendered,
+        except where a painted or refined mask differs from the rendering at the nearest border pixel.
+        """
+        mask, recorded = view.link_ids >= 0, self.sequence.recorded_camera(view.camera.name)
+        left, top, width, height = recorded.recorded_window
+        if (height, width) == mask.shape:
+            return recorded.distorted_mask(mask)
+        filled = self._wide_renderers[view.camera.name].segment_links(self.state(view.frame))[0] >= 0
+        if view.mask != "rendered":
+            rows, columns = mask.shape
+            around = (-top, height + top - rows), (-left, width + left - columns)
+            rendered = filled[-top : rows - top, -left : columns - left]
+            changed = np.pad(mask != rendered, around, mode="edge")
+            filled = np.where(changed, np.pad(mask, around, mode="edge"), filled)
+        return recorded.distorted_mask(filled)
+
+    @cached_property
+    def _wide_renderers(self) -> dict[str, ImageRenderer]:
+        """Camera -> renderer of all that its recorded images show."""
+        cameras = [self.sequence.recorded_camera(camera.name) for camera in self.scene.cameras]
+        return {one.name: ImageRenderer(self.scene, cameras=[one.name], window=one.recorded_window) for one in cameras}
+
     def image(self, view: View) -> UInt8[np.ndarray, "height width 3"]:
         """Undistorted RGB image of the view; `SequenceError` for a missing or damaged image."""
         return self.sequence.frame(view.frame.index, self.domain, [view.camera.name]).images[view.camera.name]

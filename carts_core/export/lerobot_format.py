@@ -170,8 +170,7 @@ def _collect_masks(results: _Results, progress: ExportProgress) -> None:
     dataset = results.dataset
     masks = dict(zip((camera.name for camera in dataset.scene.cameras), results.masks, strict=True))
     for view in dataset.views(progress):
-        recorded = dataset.sequence.recorded_camera(view.camera.name)
-        mask, own = recorded.distorted_mask(view.link_ids >= 0), masks[view.camera.name]
+        mask, own = dataset.recorded_mask(view), masks[view.camera.name]
         own.rows[int(results.rows[view.frame.index])] = len(own.files)
         own.files.append(_mask_file(mask))
         own.shares.append(float(mask.mean()))

@@ -76,8 +76,7 @@ def write_recorded_csv(dataset: Dataset, folder: OutputPath, progress: ExportPro
             f"{names or 'none'}). Give the table from which the sequence was imported: --recording FILE.csv."
         )
     for view in dataset.views(progress):
-        recorded = dataset.sequence.recorded_camera(view.camera.name)
-        png = mask_png(recorded.distorted_mask(view.link_ids >= 0))
+        png = mask_png(dataset.recorded_mask(view))
         write_bytes(folder / "carts_mask" / view.camera.name / f"{view.frame.frame_id}.png", png)
     for file, text in found.items():
         write_text(below(folder, root, file), text)

@@ -87,8 +87,7 @@ def _write(dataset: Dataset, bag: Path, progress: ExportProgress) -> None:
                     name, geometry = arms[arm.name]
                     for topic, message in _arm_messages(messages, stamp, dataset, view, arm, geometry):
                         write(f"/{name}/corrected/{topic}", stamp, message)
-            recorded = dataset.sequence.recorded_camera(view.camera.name)
-            png = mask_png(recorded.distorted_mask(view.link_ids >= 0))
+            png = mask_png(dataset.recorded_mask(view))
             topic = f"/{cameras[view.camera.name]}/corrected/mask/compressed"
             write(topic, stamp, messages.image(stamp, view.camera.name, png))
 

@@ -70,9 +70,8 @@ def write_surgsync(dataset: Dataset, folder: OutputPath, progress: ExportProgres
             "sequence was imported: --recording PATH."
         )
     for view in dataset.views(progress):
-        camera = dataset.sequence.recorded_camera(view.camera.name)
-        target = folder / "annotation" / "carts_mask" / camera.name / f"{view.frame.frame_id}.png"
-        write_bytes(target, mask_png(camera.distorted_mask(view.link_ids >= 0)))
+        target = folder / "annotation" / "carts_mask" / view.camera.name / f"{view.frame.frame_id}.png"
+        write_bytes(target, mask_png(dataset.recorded_mask(view)))
     written: set[Path] = set()
     write = _write_packed if is_packed(root) else _write_raw
     for arm, (name, maps) in found.items():

@@ -47,7 +47,8 @@ class _Pipe:
     """Video of a camera, written to a named pipe."""
 
     def __init__(self, scene: Scene, camera: Camera, stream: BinaryIO) -> None:
-        self._camera, self._renderer = camera, Renderer(scene, cameras=[camera.name])
+        self._camera = camera
+        self._renderer = Renderer(scene, cameras=[camera.name], window=camera.recorded_window)
         self._container = av.open(stream, "w", format="yuv4mpegpipe", container_options={"flush_packets": "1"})
         self._video = self._container.add_stream("rawvideo", rate=_RATE)
         self._video.width, self._video.height, self._video.pix_fmt = camera.width, camera.height, "yuv444p"

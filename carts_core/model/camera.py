@@ -253,12 +253,39 @@ class Camera:
             return points
         return _undistorted(points - HALF_PIXEL, self.intrinsics, self.distortion) + HALF_PIXEL
 
-    def distorted_mask(self, mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-        """Mask of a recorded image, from a mask of the undistorted image; the inverse of `undistort` up to rounding."""
+    @property
+    def recorded_window(self) -> tuple[int, int, int, int]:
+        """Left, top, width and height [px], in the undistorted image, of the image extended to all that the recorded
+        image shows, at most to twice its size; for the `window` of a renderer."""
+        if not any(self.distortion):
+            return 0, 0, self.width, self.height
+        return _distortion_maps(self.width, self.height, self.intrinsics, self.distortion)[0]
+
+    def distorted_mask(self, mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "height width"]:
+        """Mask of a recorded image; the inverse of `undistort` up to rounding.
+
+        Args:
+            mask: mask of the undistorted image, or of its `recorded_window`. With barrel distortion, the border of the
+                recorded image shows more than the undistorted image, so only the window covers it.
+
+        Raises:
+            SettingsError: the mask has another size.
+        """
         if not any(self.distortion):
             return mask
-        columns, rows = _distortion_maps(self.width, self.height, self.intrinsics, self.distortion)
-        return cv2.remap(mask.astype(np.uint8), columns, rows, cv2.INTER_NEAREST).astype(bool)
+        window, map_x, map_y = _distortion_maps(self.width, self.height, self.intrinsics, self.distortion)
+        left, top, width, height = window
+        canvas = np.zeros((height, width), np.uint8)
+        if mask.shape == (self.height, self.width):
+            canvas[-top : self.height - top, -left : self.width - left] = mask
+        elif mask.shape == canvas.shape:
+            canvas[:] = mask
+        else:
+            raise SettingsError(
+                f"camera {self.name!r} is {self.width} x {self.height} but the mask is {mask.shape[1]} x "
+                f"{mask.shape[0]}. Give a mask of the camera's size, or of its `recorded_window`, {width} x {height}."
+            )
+        return cv2.remap(canvas, map_x, map_y, cv2.INTER_NEAREST).astype(bool)
 
     def resized(self, width: int, height: int) -> "Camera":
         """Copy of the camera at another image resolution, without distortion."""
@@ -279,12 +306,23 @@ def _undistortion_maps(
 @lru_cache(maxsize=8)
 def _distortion_maps(
     width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row in the undistorted image of each pixel of a recorded image."""
+) -> tuple[tuple[int, int, int, int], np.ndarray, np.ndarray]:
+    """`Camera.recorded_window`, and column and row in it of each pixel of a recorded image."""
     rows, columns = np.mgrid[0:height, 0:width]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
     found = _undistorted(pixels, intrinsics, distortion).reshape(height, width, 2)
-    return found[..., 0].astype(np.float32), found[..., 1].astype(np.float32)
+    left, right = _margins(found[..., 0], width)
+    top, bottom = _margins(found[..., 1], height)
+    window = -left, -top, left + width + right, top + height + bottom
+    return window, (found[..., 0] + left).astype(np.float32), (found[..., 1] + top).astype(np.float32)
+
+
+def _margins(positions: Float[np.ndarray, "height width"], size: int) -> tuple[int, int]:
+    """Number of pixels before and after an axis of a size [px] that positions on it reach, at most half of the size."""
+    finite = positions[np.isfinite(positions)]
+    first, last = (finite.min(), finite.max()) if len(finite) else (0, 0)
+    before, after = np.clip([-first, last - (size - 1)], 0, size // 2)
+    return int(np.ceil(before)), int(np.ceil(after))
 
 
 def _undistorted(

@@ -3,6 +3,7 @@
 import json
 import os
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pytest
 from awkward import ARMS, CAMERA, all_views
+from tiny import recorded_mask
 
 from carts_core.errors import CartsError, SequenceError, SettingsError
 from carts_core.export import (
@@ -52,6 +54,38 @@ def test_links_and_parts_of_an_arm_make_up_the_arm(dataset: Dataset, parts: Lite
         np.testing.assert_array_equal(
             np.sum([one for piece, one in pieces if piece.arm == category.name], axis=0), mask
         )
+
+
+@pytest.fixture
+def distorted(tiny_sequence: Callable[..., Path]) -> Dataset:
+    """Data set of one frame, in which the arm crosses the border of a strongly distorted image."""
+    path = tiny_sequence(frames=1, edit=lambda text: text + "distortion = [-0.7, 0.4, 0.0, 0.0]\n")
+    sequence = Sequence.open(path)
+    return Dataset(sequence, tuple(measured_frames(sequence, [0])), sequence.scene, "regular")
+
+
+def test_the_mask_of_a_distorted_recording_reaches_the_border(distorted: Dataset) -> None:
+    (view,) = distorted.views(ExportProgress())
+    camera, mask = distorted.sequence.recorded_camera("left"), distorted.recorded_mask(view)
+    expected = recorded_mask(distorted.scene, distorted.state(view.frame), camera)
+    assert (mask != expected).sum() <= 3 and mask.shape == expected.shape
+    assert (expected & ~camera.distorted_mask(view.link_ids >= 0)).sum() > 15
+
+
+def test_corrections_at_the_border_continue_in_a_distorted_recording(distorted: Dataset) -> None:
+    (view,) = distorted.views(ExportProgress())
+    rendered, before = view.link_ids >= 0, distorted.recorded_mask(view)
+    painted = rendered.copy()
+    assert not rendered[:, 0].any() or not rendered[:, -1].any()
+    own = 0 if not rendered[:, 0].any() else -1
+    painted[:, own] = True
+    (frame,) = distorted.frames
+    changed = replace(distorted, frames=(replace(frame, masks={"left": painted}),))
+    (view,) = changed.views(ExportProgress())
+    after = changed.recorded_mask(view)
+    assert view.mask == "painted" and after[:, own].all()
+    opposite = slice(0, 40) if own == -1 else slice(-40, None)
+    assert np.array_equal(after[:, opposite], before[:, opposite])
 
 
 def test_a_corrected_mask_decides_where_arms_are_and_the_rendering_whose_they_are(dataset: Dataset) -> None:

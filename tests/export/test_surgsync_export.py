@@ -86,6 +86,7 @@ def test_masks_match_the_recorded_images(tmp_path, make):
     for view in data.views(ExportProgress()):
         mask = cv2.imread(str(out / f"annotation/carts_mask/left/{view.frame.frame_id}.png"), cv2.IMREAD_GRAYSCALE)
         assert mask is not None and mask.shape == (72, 96)
+        assert np.array_equal(mask > 127, data.recorded_mask(view))
         # The undistorted mask of the recording is the rendered one, except for pixels at its outline.
         again = camera.undistort(mask > 127)
         rendered = view.link_ids >= 0

@@ -11,9 +11,10 @@ import av
 import cv2
 import numpy as np
 import pytest
+from tiny import recorded_mask
 
 from carts_core.live import KeyedOverlay, LiveVerdict, StreamFrame, Tracked
-from carts_core.live.overlay import COLOURS, KEY
+from carts_core.live.overlay import COLOURS, KEY, keyed
 from carts_core.live.tracker import Effort, LiveEstimate
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
@@ -43,19 +44,14 @@ def eroded(mask: np.ndarray, size: int) -> np.ndarray:
     return cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-@pytest.mark.parametrize(
-    ("verdict", "current"), [*((verdict, True) for verdict in LiveVerdict), (LiveVerdict.GOOD, False)]
-)
-def test_another_program_reads_outlines_on_green(
-    sequence: Sequence, tmp_path: Path, verdict: LiveVerdict, current: bool
-) -> None:
-    pipes = {name: tmp_path / name for name in ("left", "right")}
+def pictures_of(sequence: Sequence, result: Tracked, folder: Path) -> dict[str, np.ndarray]:
+    """Picture of a result in the pipe of each camera."""
+    pipes = {camera.name: folder / camera.name for camera in sequence.scene.cameras}
     pictures: dict[str, list[np.ndarray]] = {name: [] for name in pipes}
     for pipe in pipes.values():
         os.mkfifo(pipe)
     ends = {name: os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") for name, pipe in pipes.items()}
-    age = 0.0 if current else 1.0
-    overlay, result = KeyedOverlay(sequence, pipes), replace(tracked(sequence, 1, verdict), age=age, interval=0.1)
+    overlay = KeyedOverlay(sequence, pipes)
     threads = [threading.Thread(target=read, args=(ends[name], pictures[name])) for name in pipes]
     for thread in threads:
         thread.start()
@@ -63,8 +59,18 @@ def test_another_program_reads_outlines_on_green(
     overlay.close()
     for thread in threads:
         thread.join(60.0)
-    for name in pipes:
-        (picture,) = pictures[name]
+    return {name: picture for name, (picture,) in pictures.items()}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "current"), [*((verdict, True) for verdict in LiveVerdict), (LiveVerdict.GOOD, False)]
+)
+def test_another_program_reads_outlines_on_green(
+    sequence: Sequence, tmp_path: Path, verdict: LiveVerdict, current: bool
+) -> None:
+    age = 0.0 if current else 1.0
+    result = replace(tracked(sequence, 1, verdict), age=age, interval=0.1)
+    for name, picture in pictures_of(sequence, result, tmp_path).items():
         mask = Renderer(sequence.scene, cameras=[name]).segment(result.estimate.state)[0] >= 0
         inner, smaller = (eroded(mask, size) for size in (7, 3))
         outer = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7))) > 0
@@ -74,6 +80,19 @@ def test_another_program_reads_outlines_on_green(
         wanted = COLOURS.get(verdict if current else LiveVerdict.DOUBTFUL, KEY)
         np.testing.assert_allclose(picture[rim], np.broadcast_to(wanted, picture[rim].shape), atol=3)
         assert rim.sum() > 50 and inner.any()
+
+
+def test_outlines_reach_the_border_of_distorted_images(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    lens = "distortion = [-0.7, 0.4, 0.0, 0.0]\n"
+    sequence = Sequence.open(tiny_sequence(frames=1, width=160, height=128, edit=lambda text: text + lens))
+    camera, result = sequence.recorded_camera("left"), tracked(sequence, 0, LiveVerdict.GOOD)
+    (tmp_path / "pipes").mkdir()
+    picture = pictures_of(sequence, result, tmp_path / "pipes")["left"]
+    state = result.estimate.state
+    expected = keyed(recorded_mask(sequence.scene, state, camera), LiveVerdict.GOOD)
+    inside = Renderer(sequence.scene).segment(state)[0] >= 0
+    cut = keyed(camera.distorted_mask(inside), LiveVerdict.GOOD)
+    assert (np.abs(picture - expected.astype(int)) > 3).any(2).sum() < 20 < (cut != expected).any(2).sum()
 
 
 def test_tracking_continues_if_the_reader_ends(

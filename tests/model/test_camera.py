@@ -99,6 +99,27 @@ def test_a_mask_returns_to_the_recorded_image():
     assert camera().distorted_mask(recorded) is recorded
 
 
+def test_the_window_of_a_barrel_reaches_beyond_the_image_and_that_of_a_pincushion_does_not():
+    left, top, width, height = camera(distortion=BARREL).recorded_window
+    corners = camera(distortion=BARREL).undistort_points(np.array([[0.5, 0.5], [127.5, 95.5]]))
+    assert left < -5 and top < -5
+    assert (left < corners[0, 0] < left + 2) and (left + width - 2 < corners[1, 0] < left + width)
+    assert (top < corners[0, 1] < top + 2) and (top + height - 2 < corners[1, 1] < top + height)
+    for plain in (camera(), camera(distortion=(0.3, 0.1, 0.0, 0.0))):
+        assert plain.recorded_window == (0, 0, 128, 96)
+    _, _, width, height = camera(distortion=(-30.0, 5.0, 0.0, 0.0)).recorded_window
+    assert 128 <= width <= 256 and 96 <= height <= 192
+
+
+def test_a_mask_of_the_window_fills_the_recorded_image_to_its_border():
+    distorted = camera(distortion=BARREL)
+    _, _, width, height = distorted.recorded_window
+    assert distorted.distorted_mask(np.ones((height, width), bool)).all()
+    assert not distorted.distorted_mask(np.ones((96, 128), bool))[:, 0].any()
+    with pytest.raises(SettingsError, match=rf"the mask is 64 x 48. Give a mask .* `recorded_window`, {width} x"):
+        distorted.distorted_mask(np.zeros((48, 64), bool))
+
+
 @pytest.mark.parametrize("distortion", [BARREL, (-0.45, 0.2, 0.0, 0.0)])
 def test_undistorted_points_are_distorted_to_the_same_points(distortion):
     distorted = camera(distortion=distortion, width=640, height=480, intrinsics=(400.0, 400.0, 320.0, 240.0))
