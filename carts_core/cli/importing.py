@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from ..console import Bar, Terminal
-from ..settings.interchange import AnnotationFormat, ImportOptions
+from ..settings.interchange import AnnotationFormat, DrawnOn, ImportOptions
 from .options import SequencePath
 
 if TYPE_CHECKING:
@@ -100,6 +100,9 @@ class ImportMasks:
     """Camera of the images, if its name does not occur in the names of files and folders."""
     format: AnnotationFormat | None = None
     """Format of the source; recognized by content by default."""
+    drawn_on: DrawnOn | None = None
+    """Images of a camera with distortion that were annotated; by default undistorted ones for exports of carts with
+    such images or masks, otherwise recorded ones."""
     replace: bool = False
     """Replace earlier imports. Painted layers are not changed."""
 
@@ -111,7 +114,7 @@ class ImportMasks:
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
-        found = read_annotations(self.source, sequence, self.camera, format=self.format)
+        found = read_annotations(self.source, sequence, self.camera, format=self.format, drawn_on=self.drawn_on)
         with Project.open(sequence, self.project) as project:
             report = import_annotations(project, found, source=self.source.name, replace=self.replace)
             console.print(report.sentence())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from ..package_imports import names_on_first_use
 from .interchange import ANNOTATION_FORMATS as ANNOTATION_FORMATS
 from .interchange import AnnotationFormat as AnnotationFormat
+from .interchange import DrawnOn as DrawnOn
 from .interchange import FormatName as FormatName
 from .interchange import Images as Images
 from .interchange import Masks as Masks

@@ -28,6 +28,9 @@ ANNOTATION_FORMATS: dict[AnnotationFormat, str] = {
 }
 """Format -> name in texts."""
 
+DrawnOn = Literal["recorded", "undistorted"]
+"""Images that annotations were drawn on: recorded ones, with the camera's distortion, or undistorted ones."""
+
 NO_TABLE = Path("none")
 """Value of `kinematics` for images without joint data."""
 SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -141,3 +141,16 @@ def test_the_command_asks_for_the_format_where_several_are_possible(
     assert "Imported 1 mask from LabelMe (shaft)." in capsys.readouterr().out
     with Project.open(sequence, read_only=True) as project:
         assert marked_rows(project, 0) == 20
+
+
+def test_the_command_states_whether_it_undistorts(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny_sequence(masks=False, edit=lambda text: text + "distortion = [-0.3, 0.1, 0.0, 0.0]\n")
+    write_masks(tmp_path / "theirs", 10, frames=(1,))
+    main(["import-masks", str(path), str(tmp_path / "theirs")])
+    assert "assumed to be drawn on recorded images" in capsys.readouterr().out
+    main(["import-masks", str(path), str(tmp_path / "theirs"), "--replace", "--drawn-on", "undistorted"])
+    assert "Remarks" not in capsys.readouterr().out
+    with Project.open(Sequence.open(path), read_only=True) as project:
+        assert marked_rows(project, 0) == 10

@@ -349,3 +349,65 @@ def test_points_in_corners_of_strongly_distorted_images_are_undistorted(
     ray = np.append((found - camera.K[:2, 2]) / camera.K[0, 0], 1.0)
     back, _ = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), camera.K_opencv, np.array(lens))
     np.testing.assert_allclose(back.ravel(), (1, 2), atol=1e-3)
+
+
+LENS = "distortion = [-0.3, 0.1, 0.001, -0.002]\n"
+
+
+@pytest.fixture
+def distorted(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(masks=False, edit=lambda text: text + LENS))
+
+
+def test_corrected_labels_of_an_export_are_not_undistorted_twice(distorted: Sequence, tmp_path: Path) -> None:
+    dataset = Dataset(distorted, tuple(measured_frames(distorted, range(1))), distorted.scene, "regular")
+    file = export(dataset, "coco", tmp_path / "exported") / "annotations" / "instances_default.json"
+    elsewhere = tmp_path / "downloads" / "instances.json"
+    elsewhere.parent.mkdir()
+    elsewhere.write_bytes(file.read_bytes())
+    found = read_annotations(file, distorted)
+    (exported,) = found.frames
+    assert exported.labels is not None and exported.labels.any()
+    assert "are assumed to be drawn on undistorted images, as in this export" in " ".join(found.remarks)
+    found = read_annotations(elsewhere, distorted, drawn_on="undistorted")
+    (corrected,) = found.frames
+    assert corrected.labels is not None and np.array_equal(corrected.labels, exported.labels) and not found.remarks
+    found = read_annotations(elsewhere, distorted)
+    (assumed,) = found.frames
+    camera = distorted.recorded_camera("left")
+    assert assumed.labels is not None
+    assert np.array_equal(assumed.labels, camera.undistort(exported.labels, cv2.INTER_NEAREST))
+    assert "drawn on recorded images. If" in " ".join(found.remarks)
+    assert "--drawn-on undistorted" in " ".join(found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("content", "folder", "recorded"),
+    [
+        ('{"format": "surgsync"}', "annotation/carts_mask", True),
+        ('{"format": "recorded-csv"}', "carts_mask", True),
+        ('{"format": "recorded-csv"}', "rendered", False),
+        ('{"format": "masks"}', "binary", False),
+        ('{"format": "sequence"}', "theirs", True),
+        ("damaged", "theirs", True),
+    ],
+)
+def test_masks_in_exports_are_undistorted_as_their_format_requires(
+    distorted: Sequence, tmp_path: Path, content: str, folder: str, recorded: bool
+) -> None:
+    place = tmp_path / "exported" / folder
+    write_png(place / "left" / "001.png", disc(3) * np.uint8(255))
+    (tmp_path / "exported" / "export.json").write_text(content)
+    for confined in (False, True):
+        found = read_annotations(place, distorted, confined=confined)
+        (frame,) = found.frames
+        assert frame.labels is not None
+        wanted = distorted.recorded_camera("left").undistort(disc(3)) if recorded else disc(3)
+        assert np.array_equal(frame.labels > 0, wanted)
+        assert f"drawn on {'recorded' if recorded else 'undistorted'} images" in next(iter(found.remarks))
+
+
+def test_cameras_without_distortion_need_no_remark(sequence: Sequence, tmp_path: Path) -> None:
+    write_png(tmp_path / "left" / "001.png", disc(3) * np.uint8(255))
+    found = read_annotations(tmp_path / "left", sequence)
+    assert len(list(found.frames)) == 1 and not found.remarks

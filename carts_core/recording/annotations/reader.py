@@ -4,14 +4,19 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+from typing import get_args
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from ...errors import SequenceError
+from ...files import MARKER
+from ...files.reading import is_regular
 from ...model.camera import Camera
+from ...settings import DrawnOn, FormatName
 from ..importing.cameras import side_of
+from ..importing.found import read_json
 from ..sequence import Sequence
 from .images import BACKGROUND, MAX_LABELS, Annotations, ForeignImage, FrameAnnotation
 from .label_studio import file_of_address
@@ -19,7 +24,12 @@ from .recognition import AnnotationFormat, recognized
 
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
 """Files to read in the folder of an export."""
-_OWN_EXPORT = "export.json"
+_UNDISTORTED = ("masks", "coco", "coco-keypoints", "bop", "yolo", "voc", "cvat", "datumaro")
+"""Export formats whose labels refer to undistorted images; those of all others refer to recorded images."""
+_RENDERED = "rendered"
+"""Folder of an export in any format with masks of undistorted images."""
+_LEVELS = 4
+"""Number of folders, from that of the annotations upwards, in which the description of an export is looked for."""
 _ROBOFLOW = re.compile(r"_(?:jpe?g|png|bmp|tiff?)\.rf\.[0-9A-Za-z]+$", re.IGNORECASE)
 """End that Roboflow adds to the name of an image, with digits that are not a frame number."""
 
@@ -30,12 +40,13 @@ def read_annotations(
     camera: str | None = None,
     *,
     format: AnnotationFormat | None = None,
+    drawn_on: DrawnOn | None = None,
     confined: bool = False,
 ) -> Annotations:
     """Read masks and keypoints for the frames of a sequence.
 
     Frames are matched by their ids or by the last number in image names, cameras by their names or by left and right.
-    Annotations of images with distortion are undistorted, unless they were exported by carts.
+    Annotations drawn on recorded images of a camera with distortion are undistorted.
 
     Args:
         source: a file of COCO, CVAT, LabelMe, X-AnyLabeling or Label Studio, keypoints of SurgPose, a folder of LabelMe
@@ -43,6 +54,8 @@ def read_annotations(
         sequence: sequence with the frames.
         camera: camera of the images, if their names do not contain it.
         format: format of the source, recognized by its content by default.
+        drawn_on: images that the annotations were drawn on. By default undistorted ones in exports of carts in formats
+            of annotation tools, otherwise recorded ones; a remark states the assumption.
         confined: whether links, and files next to the source, are ignored.
 
     Raises:
@@ -55,17 +68,35 @@ def read_annotations(
     place = next((source / name for name in sorted(_INSIDE) if (source / name).is_file()), source)
     remarks: Counter[str] = Counter()
     kind, images = recognized(place, format, remarks, confined=confined)
-    own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
     labels: list[str] = []
     unknown: list[str] = []
-    reader = _FrameReader(sequence, camera, source.name, labels, unknown, undistorted=own)
+    exported = None if drawn_on else _exported_on(place, confined)
+    reader = _FrameReader(sequence, camera, source.name, labels, unknown, drawn_on, exported, remarks)
     return Annotations(kind, reader.frames(images), labels, unknown, remarks)
 
 
 def find_frame(image: str, sequence: Sequence) -> tuple[int, str] | None:
     """Index of the frame and name of the camera of an image, given its name, path or address; None for other images."""
-    matcher = _FrameReader(sequence, None, "", [], [], undistorted=False)
+    matcher = _FrameReader(sequence, None, "", [], [])
     return matcher.place(ForeignImage(file_of_address(image)))
+
+
+def _exported_on(place: Path, confined: bool) -> DrawnOn | None:
+    """Images that the labels of an export of carts refer to; None if the annotations are not in an export."""
+    place = place.absolute()
+    for folder in (place, *place.parents)[:_LEVELS]:
+        marker = folder / MARKER
+        if not is_regular(marker) or (confined and marker.is_symlink()):
+            continue
+        try:
+            content = read_json(marker)
+        except SequenceError:
+            return None
+        format = content.get("format") if isinstance(content, dict) else None
+        if format in _UNDISTORTED or _RENDERED in place.relative_to(folder).parts[:1]:
+            return "undistorted"
+        return "recorded" if format in get_args(FormatName) else None
+    return None
 
 
 class _FrameReader:
@@ -78,11 +109,15 @@ class _FrameReader:
         source: str,
         labels: list[str],
         unknown: list[str],
-        *,
-        undistorted: bool,
+        drawn_on: DrawnOn | None = None,
+        exported: DrawnOn | None = None,
+        remarks: Counter[str] | None = None,
     ) -> None:
         self._sequence, self._camera, self._source = sequence, camera, source
-        self._labels, self._unknown, self._undistorted = labels, unknown, undistorted
+        self._labels, self._unknown = labels, unknown
+        self._drawn_on: DrawnOn | None = drawn_on
+        self._exported: DrawnOn | None = exported
+        self._remarks = Counter() if remarks is None else remarks
         self._cameras = [own.name for own in sequence.scene.cameras]
         self._ids = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
         self._numbers = {int(name): index for name, index in self._ids.items() if name.isdecimal()}
@@ -139,6 +174,9 @@ class _FrameReader:
     def _joined(self, at: tuple[int, str], images: list[ForeignImage]) -> FrameAnnotation:
         index, name = at
         camera = self._sequence.recorded_camera(name)
+        drawn_on = self._drawn_on or self._exported or "recorded"
+        if self._drawn_on is None and any(camera.distortion):
+            self._remarks[_assumption(name, self._exported)] += 1
         labels: UInt8[np.ndarray, "height width"] | None = None
         points: dict[str, tuple[float, float]] = {}
         for image in images:
@@ -157,10 +195,21 @@ class _FrameReader:
                     self._labels.append(label)
                 if label:
                     labels[mask] = self._labels.index(label) + 1
-        if not self._undistorted:
+        if drawn_on == "recorded":
             labels = None if labels is None else camera.undistort(labels, cv2.INTER_NEAREST)
             points = _undistorted(points, camera)
         return FrameAnnotation(index, name, labels, points)
+
+
+def _assumption(camera: str, exported: DrawnOn | None) -> str:
+    """Remark on the images that annotations of a camera with distortion are assumed to be drawn on."""
+    drawn_on, other = ("undistorted", "recorded") if exported == "undistorted" else ("recorded", "undistorted")
+    source = ", as in this export" if exported else ""
+    return (
+        f"camera {camera!r} has distortion; its annotations are assumed to be drawn on {drawn_on} images{source}. If "
+        f"they were drawn on {other} images{'' if exported else ', such as those in exports'}, import them with Drawn "
+        f"on (--drawn-on {other})"
+    )
 
 
 def _check_size(name: str, size: tuple[int, ...], camera: Camera) -> None:
