@@ -411,3 +411,54 @@ def test_cameras_without_distortion_need_no_remark(sequence: Sequence, tmp_path:
     write_png(tmp_path / "left" / "001.png", disc(3) * np.uint8(255))
     found = read_annotations(tmp_path / "left", sequence)
     assert len(list(found.frames)) == 1 and not found.remarks
+
+
+@pytest.mark.parametrize(
+    ("names", "frames"),
+    [
+        (["img1_inst1", "img1_inst2", "img2_inst1", "img3_inst1"], [0, 0, 1, 2]),
+        (["frame_002_mask0", "frame_003_mask0"], [1, 2]),
+        (["tool1_frame001", "tool2_frame001"], [0, 0]),
+        (["2024_seq7_1", "2024_seq7_3"], [0, 2]),
+        (["img900_mask1", "img901_mask1"], []),
+        (["seq_001_frame3"], [2]),
+    ],
+)
+def test_the_frame_number_is_found_beside_numbers_of_instances(
+    sequence: Sequence, tmp_path: Path, names: list[str], frames: list[int]
+) -> None:
+    for number, name in enumerate(names):
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[10 * number : 10 * number + 10] = 255
+        write_png(tmp_path / "left" / f"{name}.png", mask)
+    found, _, unknown = all_of(tmp_path / "left", sequence)
+    assert {at for at, _ in found} == set(frames) and len(unknown) == len(names) - len(frames)
+    for number, frame in enumerate(frames):
+        assert (found[frame, "left"].labels[10 * number : 10 * number + 10] > 0).all()
+
+
+def test_a_frame_number_before_another_number_is_remarked(sequence: Sequence, tmp_path: Path) -> None:
+    for name in ("img2_inst1", "img3_inst1"):
+        write_png(tmp_path / "left" / f"{name}.png", disc(3) * np.uint8(255))
+    found = read_annotations(tmp_path / "left", sequence)
+    assert len(list(found.frames)) == 2
+    assert list(found.remarks) == ["the frame number is 2 in names such as img2_inst1"]
+
+
+def test_a_padded_id_is_the_frame_number_even_in_one_name(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    path = tiny_sequence(masks=False, edit=lambda text: text.replace("{frame:03d}", "{frame:06d}"))
+    for image in (path.parent / "regular" / "left").iterdir():
+        image.rename(image.with_name(f"000{image.name}"))
+    sequence = Sequence.open(path)
+    assert sequence.frame_ids[1] == "000002"
+    for name in ("frame_000002_mask0", "frame_000002_mask1"):
+        write_png(tmp_path / "theirs" / f"{name}.png", disc(3) * np.uint8(255))
+        frames, _, _ = all_of(tmp_path / "theirs", sequence)
+        assert [*frames] == [(1, "left")]
+
+
+def test_ambiguous_frame_numbers_are_refused(sequence: Sequence, tmp_path: Path) -> None:
+    for name in ("a1_b1", "a1_b2", "a2_b1", "a2_b2"):
+        write_png(tmp_path / "left" / f"{name}.png", disc(3) * np.uint8(255))
+    with pytest.raises(SequenceError, match=r"which number in a1_b1, a1_b2 \.\.\. .* such as 001\."):
+        all_of(tmp_path / "left", sequence)

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import get_args
 
@@ -18,6 +18,7 @@ from ...settings import DrawnOn, FormatName
 from ..importing.cameras import side_of
 from ..importing.found import read_json
 from ..sequence import Sequence
+from .frame_numbers import FrameNumbers
 from .images import BACKGROUND, MAX_LABELS, Annotations, ForeignImage, FrameAnnotation
 from .label_studio import file_of_address
 from .recognition import AnnotationFormat, recognized
@@ -45,7 +46,8 @@ def read_annotations(
 ) -> Annotations:
     """Read masks and keypoints for the frames of a sequence.
 
-    Frames are matched by their ids or by the last number in image names, cameras by their names or by left and right.
+    Frames are matched by their ids or by a number in image names (see `FrameNumbers`), cameras by their names or by
+    left and right.
     Annotations drawn on recorded images of a camera with distortion are undistorted.
 
     Args:
@@ -79,6 +81,16 @@ def find_frame(image: str, sequence: Sequence) -> tuple[int, str] | None:
     """Index of the frame and name of the camera of an image, given its name, path or address; None for other images."""
     matcher = _FrameReader(sequence, None, "", [], [])
     return matcher.place(ForeignImage(file_of_address(image)))
+
+
+def _stem(image: ForeignImage) -> str:
+    """Name of an image without folder, suffix and the end that Roboflow adds."""
+    return _ROBOFLOW.sub("", PurePosixPath(image.name.replace("\\", "/")).stem)
+
+
+def _name(image: ForeignImage, camera: str) -> str:
+    """Given frame number of an image, or its name without that of its camera."""
+    return image.frame or _stem(image).removeprefix(f"{camera}_").removesuffix(f"_{camera}")
 
 
 def _exported_on(place: Path, confined: bool) -> DrawnOn | None:
@@ -120,13 +132,15 @@ class _FrameReader:
         self._remarks = Counter() if remarks is None else remarks
         self._cameras = [own.name for own in sequence.scene.cameras]
         self._ids = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
-        self._numbers = {int(name): index for name, index in self._ids.items() if name.isdecimal()}
+        self._numbers = {name: FrameNumbers(self._ids) for name in ([camera] if camera else self._cameras)}
 
-    def frames(self, images: Iterator[ForeignImage]) -> Iterator[FrameAnnotation]:
+    def frames(self, images: Iterable[ForeignImage]) -> Iterator[FrameAnnotation]:
         """One annotation per frame and camera; consecutive images of the same frame are merged."""
         at: tuple[int, str] | None = None
         joined: list[ForeignImage] = []
         done: set[tuple[int, str]] = set()
+        images = [*images]  # Only all names together show which number is that of the frame.
+        self._learn_names(images)
         for image in images:
             found = self.place(image)
             if found is None:
@@ -149,13 +163,23 @@ class _FrameReader:
         camera = self._camera_of(image)
         if camera is None:
             return None
-        stem = _ROBOFLOW.sub("", PurePosixPath(image.name.replace("\\", "/")).stem)
-        for text in (image.frame, stem, stem.removeprefix(f"{camera}_"), stem.removesuffix(f"_{camera}")):
-            if text in self._ids:
-                return self._ids[text], camera
-        digits = re.findall(r"\d+", image.frame or stem)
-        index = self._numbers.get(int(digits[-1])) if digits and len(digits[-1]) < 18 else None
+        given = self._given(image)
+        index = self._numbers[camera].find(_name(image, camera)) if given is None else given
         return None if index is None else (index, camera)
+
+    def _given(self, image: ForeignImage) -> int | None:
+        """Index of the frame whose id is given with an image or is its name."""
+        return self._ids.get(image.frame, self._ids.get(_stem(image)))
+
+    def _learn_names(self, images: Iterable[ForeignImage]) -> None:
+        """Find out which number in the names of each camera's images is that of the frame."""
+        names: dict[str, list[str]] = {}
+        for image in images:
+            camera = self._camera_of(image)
+            if camera is not None and self._given(image) is None:
+                names.setdefault(camera, []).append(_name(image, camera))
+        for camera, own in names.items():
+            self._numbers[camera].learn(own, self._remarks)
 
     def _camera_of(self, image: ForeignImage) -> str | None:
         if self._camera is not None or image.camera in self._cameras:

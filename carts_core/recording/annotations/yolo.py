@@ -69,7 +69,7 @@ def read_yolo(
     names = {} if names_file is None else _names(names_file)
     for file in files:
         with well_formed(f"{file} cannot be read", "Export it again."):
-            lines = [line.split() for line in read_text(file, LABELS).splitlines() if line.strip()]
+            lines = [line for line in read_text(file, LABELS).splitlines() if line.strip()]
             check_shapes(len(lines))
         name = file.relative_to(folder.parent).as_posix()
         yield ForeignImage(name, _Lines(name, lines, names, names_file is None, remarks).parts)
@@ -79,14 +79,14 @@ class _Lines:
     """Lines of a label file."""
 
     def __init__(
-        self, name: str, lines: Sequence[list[str]], names: dict[int, str], unnamed: bool, remarks: Counter[str]
+        self, name: str, lines: Sequence[str], names: dict[int, str], unnamed: bool, remarks: Counter[str]
     ) -> None:
         self._name, self._lines, self._names, self._unnamed, self._remarks = name, lines, names, unnamed, remarks
 
     def parts(self, height: int, width: int) -> Iterator[Part]:
         """Label and pixels of each line."""
-        for number, words in enumerate(self._lines, start=1):
-            part = None
+        for number, line in enumerate(self._lines, start=1):
+            part, words = None, line.split()
             with or_left_out(f"line {number} of {self._name}", self._remarks):
                 part = self._label(int(words[0])), _mask(words[1:], height, width)
             if part is not None:
