@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
+from videos import write_video
 
 from carts_core.errors import SequenceError
 from carts_core.export import Dataset, FormatName, export, measured_frames
@@ -462,3 +463,26 @@ def test_ambiguous_frame_numbers_are_refused(sequence: Sequence, tmp_path: Path)
         write_png(tmp_path / "left" / f"{name}.png", disc(3) * np.uint8(255))
     with pytest.raises(SequenceError, match=r"which number in a1_b1, a1_b2 \.\.\. .* such as 001\."):
         all_of(tmp_path / "left", sequence)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "remarked"), [((1, 2, 3), True), ((3,), True), ((0, 1, 2), False), ((2,), False), ((0, 3), False)]
+)
+def test_images_of_a_video_that_are_numbered_from_one_are_remarked(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, numbers: tuple[int, ...], remarked: bool
+) -> None:
+    images = tmp_path / "recording" / "left.mp4"
+    images.parent.mkdir()
+    write_video(images, [np.full((HEIGHT, WIDTH, 3), 60, np.uint8)] * 3, milliseconds=np.array([0, 100, 200]))
+
+    def as_video(text: str) -> str:
+        text = text.replace('"{domain}/{camera}/{frame}.png"', f'"{images}"').replace('frame_id = "{frame:03d}"\n', "")
+        return text.replace("[kinematics]", f'[frames]\nframe_id = "{{frame:06d}}"\nvideo = "{images}"\n[kinematics]')
+
+    sequence = Sequence.open(tiny_sequence(masks=False, truth=False, edit=as_video))
+    assert int(sequence.frame_ids[0]) == 0 and len(sequence) == 3
+    for number in numbers:
+        write_png(tmp_path / "theirs" / f"{number:06d}.png", disc(3) * np.uint8(255))
+    found = read_annotations(tmp_path / "theirs", sequence)
+    list(found.frames)
+    assert any("are numbered from 0" in remark and "-start_number 0" in remark for remark in found.remarks) == remarked

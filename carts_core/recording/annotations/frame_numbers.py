@@ -37,9 +37,8 @@ class FrameNumbers:
             SequenceError: two numbers may be that of the frame.
         """
         patterns: dict[str, dict[str, list[str]]] = {}
-        for name in names:
-            if name not in self._ids:
-                patterns.setdefault(_DIGITS.sub("#", name), {})[name] = _DIGITS.findall(name)
+        for name in filter(_DIGITS.search, names):
+            patterns.setdefault(_DIGITS.sub("#", name), {})[name] = _DIGITS.findall(name)
         for pattern, rows in patterns.items():
             place = self._places[pattern] = self._chosen(rows)
             example, numbers = next(iter(rows.items()))
@@ -50,20 +49,31 @@ class FrameNumbers:
 
     def find(self, name: str) -> int | None:
         """Index of the frame whose id is a name, or the number in it; None without such a frame."""
+        return self._ids[name] if name in self._ids else self._index(self._text(name))
+
+    def begin_at_one(self, names: Iterable[str]) -> bool:
+        """Whether images of frames that begin at 0 seem to be numbered from 1: none has the number 0, and one has 1
+        or the number after the last frame."""
+        found = {int(text) for text in map(self._text, names) if 0 < len(text) < _LONGEST}
+        frames = self._values.keys()
+        return 0 in frames and bool(found) and 0 not in found and (1 in found or max(frames) + 1 in found)
+
+    def _text(self, name: str) -> str:
+        """Frame number in a name; empty without a number."""
         numbers = _DIGITS.findall(name)
-        if name in self._ids or not numbers:
-            return self._ids.get(name)
+        if not numbers:
+            return ""
         place = self._places.get(_DIGITS.sub("#", name))
-        return self._index(numbers[self._chosen({name: numbers}) if place is None else place])
+        return numbers[self._chosen({name: numbers}) if place is None else place]
 
     def _index(self, text: str) -> int | None:
-        by_value = self._values.get(int(text)) if len(text) < _LONGEST else None
+        by_value = self._values.get(int(text)) if 0 < len(text) < _LONGEST else None
         return self._ids.get(text, by_value)
 
     def _chosen(self, rows: Mapping[str, list[str]]) -> int:
         """Place of the frame number, counted from the last number."""
         columns = [*zip(*rows.values(), strict=True)]
-        *others, last = range(-len(columns), 0) if columns else (_LAST,)
+        *others, last = range(-len(columns), 0)
         if not others:
             return last
         exact = {place for place in (*others, last) if self._has_ids(columns[place])}

@@ -15,6 +15,8 @@ from ...files import MARKER
 from ...files.reading import is_regular
 from ...model.camera import Camera
 from ...settings import DrawnOn, FormatName
+from ..image_sources import Cropped
+from ..images import ImageFiles
 from ..importing.cameras import side_of
 from ..importing.found import read_json
 from ..sequence import Sequence
@@ -91,6 +93,14 @@ def _stem(image: ForeignImage) -> str:
 def _name(image: ForeignImage, camera: str) -> str:
     """Given frame number of an image, or its name without that of its camera."""
     return image.frame or _stem(image).removeprefix(f"{camera}_").removesuffix(f"_{camera}")
+
+
+def _is_video(sequence: Sequence, camera: str) -> bool:
+    """Whether the images of a camera are decoded from a video or bag, whose frames are numbered by the program."""
+    source = sequence.image_source(camera)
+    while isinstance(source, Cropped):
+        source = source.source
+    return not isinstance(source, ImageFiles)
 
 
 def _exported_on(place: Path, confined: bool) -> DrawnOn | None:
@@ -175,11 +185,17 @@ class _FrameReader:
         """Find out which number in the names of each camera's images is that of the frame."""
         names: dict[str, list[str]] = {}
         for image in images:
-            camera = self._camera_of(image)
-            if camera is not None and self._given(image) is None:
+            if (camera := self._camera_of(image)) is not None and image.frame not in self._ids:
                 names.setdefault(camera, []).append(_name(image, camera))
         for camera, own in names.items():
-            self._numbers[camera].learn(own, self._remarks)
+            numbers = self._numbers[camera]
+            numbers.learn([name for name in own if name not in self._ids], self._remarks)
+            if self._exported is None and _is_video(self._sequence, camera) and numbers.begin_at_one(own):
+                self._remarks[
+                    f"no image of camera {camera!r} has the number 0, but frames of its video are numbered from 0; if "
+                    "the images were extracted with numbers from 1, as by ffmpeg, the annotations are one frame late: "
+                    "rename the images, or extract them with -start_number 0"
+                ] += 1
 
     def _camera_of(self, image: ForeignImage) -> str | None:
         if self._camera is not None or image.camera in self._cameras:
