@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 
 from ..errors import RobotError, SettingsError
 from ..files.reading import pixels_problem
-from ..model.camera import HALF_PIXEL, Camera, implausible_intrinsics, pinhole_intrinsics, rigid_transform
+from ..model.camera import (
+    HALF_PIXEL,
+    Camera,
+    implausible_intrinsics,
+    pinhole_intrinsics,
+    rigid_transform,
+    unusual_tangential,
+)
 from ..model.robot import Robot
 from ..model.scene import Arm
 from ..recording.images import read_image, read_mask
@@ -136,6 +143,8 @@ def camera_of(
     found = []
     if (problem := implausible_intrinsics(width, height, intrinsics, camera.distortion)) is not None:
         found.append(f"K is unusual: it has {problem}. Check that K belongs to this image size, in pixels.")
+    if (problem := unusual_tangential(camera.distortion)) is not None:
+        found.append(f"the distortion is unusual: it has {problem}.")
     if pixel_center is None and intrinsics[2:] == (width / 2 + HALF_PIXEL, height / 2 + HALF_PIXEL):
         found.append(
             f"the principal point of K is ({width / 2:g}, {height / 2:g}), exactly half the image size. In OpenCV's "

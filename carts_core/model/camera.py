@@ -168,6 +168,22 @@ def _folds(
     return bool((np.diff(distorted) <= 0).any())
 
 
+_MAX_TANGENTIAL = 0.01
+"""Magnitude beyond which tangential distortion is unusual [1]."""
+
+
+def unusual_tangential(distortion: tuple[float, ...]) -> str | None:
+    """Description of unusually large tangential distortion as a phrase that follows "it has", with a remedy; None for
+    usual coefficients. Fisheye coefficients k1 k2 k3 k4 without the name of their model have such values."""
+    p1, p2 = (*distortion, *[0.0] * 4)[2:4]
+    if max(abs(p1), abs(p2)) <= _MAX_TANGENTIAL:
+        return None
+    return (
+        f"the unusual tangential distortion p1 = {p1:g}, p2 = {p2:g}. Is it a fisheye calibration (cv2.fisheye: k1 k2 "
+        "k3 k4)? That model is not supported: rectify the images, or calibrate with cv2.calibrateCamera (k1 k2 p1 p2)"
+    )
+
+
 # Cameras are compared by identity, since element-wise comparison of arrays has no single truth value.
 @dataclass(frozen=True, eq=False)
 class Camera:

@@ -20,6 +20,7 @@ from ..model.camera import (
     implausible_intrinsics,
     pinhole_intrinsics,
     rigid_transform,
+    unusual_tangential,
 )
 from ..model.instruments import SCHEME, robot_file
 from ..model.robot import Robot
@@ -162,6 +163,8 @@ class CameraInput:
         found += mask_remarks(list(files))
         unusual = implausible_intrinsics(camera.width, camera.height, camera.intrinsics, camera.distortion)
         found += [f"its calibration has {unusual}. Check `size`, `K` and `distortion`."] if unusual else []
+        tangential = unusual_tangential(camera.distortion)
+        found += [f"its calibration has {tangential}."] if tangential else []
         return tuple(dict.fromkeys(f"{camera.name}: {text}" for text in found))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SequenceError
-from ...model.camera import implausible_intrinsics
+from ...model.camera import implausible_intrinsics, unusual_tangential
 from ..image_sources import VIDEO_SUFFIXES
 from ..images import ImageFiles, bits_remark, image_remarks, is_deep
 from ..video import Video, index_video
@@ -146,6 +146,8 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
     shift = 0.5 - camera.pixel_center
     problem = implausible_intrinsics(*camera.size, (fx, fy, cx + shift, cy + shift), camera.distortion)
     if problem is None:
+        if (tangential := unusual_tangential(camera.distortion)) is not None:
+            job.warning(f"the calibration has {tangential}.", camera.name)
         return
     if camera.name in job.options.calibration_size and min(fx, fy) > 0:
         job.warning(f"the calibration has {problem}.", camera.name)

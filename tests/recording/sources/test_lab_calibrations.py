@@ -403,3 +403,14 @@ def test_new_recording_asks_for_the_size_of_the_calibrated_images(tmp_path: Path
     assert answered is not None
     recording = guess(answered).recording
     assert recording is not None and recording.cameras[0].intrinsics == pytest.approx((700, 705, 330, 235))
+
+
+@pytest.mark.parametrize(("distortion", "warned"), [([-0.05, 0.06, -0.09, 0.03], True), (D[:4], False), (D, False)])
+def test_coefficients_that_may_be_those_of_a_fisheye_lens_are_a_warning(
+    tmp_path: Path, distortion: list[float], warned: bool
+) -> None:
+    (tmp_path / "fisheye.json").write_text(json.dumps({"K": K.tolist(), "D": distortion}))
+    found = imported(tmp_path, {"left": tmp_path / "fisheye.json"})
+    warnings = [str(note) for note in found.notes if note.kind == "warning" and "Is it a fisheye" in str(note)]
+    assert len(warnings) == warned
+    assert not warned or "p1 = -0.09, p2 = 0.03" in warnings[0]
