@@ -429,9 +429,7 @@ class TransferHandler(Handler):
         def read(cancelled: threading.Event = self._cancelled) -> AnnotationEdits:
             from carts_core.recording.annotations import read_annotations  # noqa: PLC0415  imports all importers
 
-            found = read_annotations(
-                path, sequence, intent.camera, format=intent.format, drawn_on=intent.drawn_on, confined=True
-            )
+            found = read_annotations(path, sequence, intent.camera, format=intent.format, confined=True)
             return annotation_edits(state, replace(found, frames=self._counted(found.frames, cancelled)))
 
         self._import = _threads().submit(read)

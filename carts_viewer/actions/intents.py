@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 from carts_core.export import FormatName, Parts
 from carts_core.project import ReviewState
-from carts_core.settings import AnnotationFormat, Direction, DrawnOn, Masks
+from carts_core.settings import AnnotationFormat, Direction, Masks
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target, Tool
 from carts_viewer.state import ComparedPose, CompareMode, Reach
@@ -580,8 +580,6 @@ class ImportMasks(Intent):
     """Format of the source; None to recognize it by content."""
     replace: bool = False
     """Whether previously imported layers may be replaced."""
-    drawn_on: DrawnOn | None = None
-    """Images that were annotated; None to infer them, see `read_annotations`."""
 
 
 class CancelImport(Intent):

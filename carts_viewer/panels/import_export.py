@@ -4,7 +4,7 @@ import viser
 
 from carts_core.export import FORMATS, FormatName, formats_of
 from carts_core.project import Key, ProjectState, ReviewState
-from carts_core.settings import ANNOTATION_FORMATS, AnnotationFormat, DrawnOn
+from carts_core.settings import ANNOTATION_FORMATS, AnnotationFormat
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings, frames_within
@@ -127,11 +127,6 @@ _FORMATS: dict[str, AnnotationFormat | None] = {
     **{name[0].upper() + name[1:]: format for format, name in ANNOTATION_FORMATS.items()},
 }
 """Choices of the format of imported annotations."""
-_DRAWN_ON: dict[str, DrawnOn | None] = {
-    "Automatic": None,
-    "Recorded images": "recorded",
-    "Undistorted images": "undistorted",
-}
 
 
 class ImportPanel:
@@ -146,12 +141,6 @@ class ImportPanel:
                 "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Camera whose images were annotated"
             )
             self._format = gui.add_dropdown("Source format", [*_FORMATS], hint="Format of the annotations")
-            self._drawn_on = gui.add_dropdown(
-                "Drawn on",
-                [*_DRAWN_ON],
-                visible=any(any(session.sequence.recorded_camera(name).distortion) for name in cameras),
-                hint="Automatic: undistorted images for exports with such images or masks, otherwise recorded images",
-            )
             self._replace = gui.add_checkbox("Replace", False, hint="Replace earlier imports")
             self._import = page.button("Import masks", lambda _: self._intent(), icon=viser.Icon.FILE_IMPORT)
             self._cancel = page.button("Cancel import", intents.CancelImport(), icon=viser.Icon.X, visible=False)
@@ -160,8 +149,7 @@ class ImportPanel:
     def _intent(self) -> intents.ImportMasks:
         camera = None if self._camera.value == _BY_NAME else self._camera.value
         chosen = _FORMATS.get(str(self._format.value))
-        drawn_on = _DRAWN_ON.get(str(self._drawn_on.value))
-        return intents.ImportMasks(str(self._path.value), camera, chosen, bool(self._replace.value), drawn_on)
+        return intents.ImportMasks(str(self._path.value), camera, chosen, bool(self._replace.value))
 
     def show(self, state: ViewState) -> None:
         """Update the text."""

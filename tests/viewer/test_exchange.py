@@ -267,23 +267,6 @@ def test_masks_of_others_are_imported_and_chosen_in_the_panels(open_viewer: Open
         assert app.wait_until_shown().imported == ("Imported 2 masks and keypoints of 2 images from COCO (grasper).")
 
 
-def test_the_annotated_images_are_chosen_if_a_camera_has_distortion(
-    open_viewer: OpenViewer, shared_viewer: ViewerApp
-) -> None:
-    with RawTab(shared_viewer.url) as tab:
-        assert not widget(shared_viewer, tab, "Drawn on").visible
-    lens = "distortion = [-0.3, 0.1, 0.0, 0.0]\n"
-    app = open_viewer(write_theirs, masks=False, edit=lambda text: text + lens)
-    with RawTab(app.url) as tab:
-        drawn_on = widget(app, tab, "Drawn on")
-        assert drawn_on.visible
-        tab.set(app.page.element_id(drawn_on), "Undistorted images")
-        tab.set(app.page.element_id(widget(app, tab, "From")), "theirs.json")
-        tab.set(app.page.element_id(widget(app, tab, "Import masks")), True)
-        eventually(lambda: app.state.imported)
-        assert app.wait_until_shown().imported == ("Imported 2 masks and keypoints of 2 images from COCO (grasper).")
-
-
 def test_an_import_holds_up_no_other_tab_and_can_be_cancelled(
     open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

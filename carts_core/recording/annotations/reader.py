@@ -247,8 +247,8 @@ def _assumption(camera: str, exported: DrawnOn | None) -> str:
     source = ", as in this export" if exported else ""
     return (
         f"camera {camera!r} has distortion; its annotations are assumed to be drawn on {drawn_on} images{source}. If "
-        f"they were drawn on {other} images{'' if exported else ', such as those in exports'}, import them with Drawn "
-        f"on (--drawn-on {other})"
+        f"they were drawn on {other} images{'' if exported else ', such as those in exports'}, import them with "
+        f"carts import-masks --drawn-on {other}"
     )
 
 
