@@ -45,6 +45,8 @@ class QueuedIntent(Generic[T]):
 
 _BOUNDARIES = (intents.Released, intents.ShowFrame)
 """Classes of intents that give earlier and later intents another meaning: another gesture, or another frame."""
+_EDITS = (intents.SetJoint, intents.DragLink, intents.PointAt, intents.SetNote)
+"""Classes of intents that depend on gesture or frame."""
 _WITHOUT_ORDER = (intents.Drawn, intents.Refresh)
 """Classes of intents whose place among others does not matter."""
 
@@ -102,14 +104,13 @@ class IntentQueue(Generic[T]):
 
 def _separates(older: QueuedIntent[T], between: QueuedIntent[T]) -> bool:
     """Whether an intent must not be replaced by a newer one because of another intent that was queued after it."""
-    if (
-        between.tab != older.tab
-        or isinstance(older.intent, _WITHOUT_ORDER)
-        or isinstance(between.intent, _WITHOUT_ORDER)
-    ):
+    first, then = older.intent, between.intent
+    if between.tab != older.tab or isinstance(first, _WITHOUT_ORDER):
         return False
     return (
-        between.intent.key is None or isinstance(between.intent, _BOUNDARIES) or isinstance(older.intent, _BOUNDARIES)
+        then.key is None
+        or (isinstance(first, _EDITS) and isinstance(then, _BOUNDARIES))
+        or (isinstance(first, _BOUNDARIES) and isinstance(then, _EDITS))
     )
 
 
