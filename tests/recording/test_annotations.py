@@ -13,8 +13,6 @@ from videos import write_video
 from carts_core.errors import SequenceError
 from carts_core.export import Dataset, FormatName, export, measured_frames
 from carts_core.model.camera import Camera
-from carts_core.project.layers import ImportedMask
-from carts_core.project.masks import ignored_labels
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
 from carts_core.recording.annotations.shapes import mask_of_polygon, mask_of_runs, runs_of_text
@@ -488,35 +486,3 @@ def test_images_of_a_video_that_are_numbered_from_one_are_remarked(
     found = read_annotations(tmp_path / "theirs", sequence)
     list(found.frames)
     assert any("are numbered from 0" in remark and "-start_number 0" in remark for remark in found.remarks) == remarked
-
-
-@pytest.mark.parametrize(
-    ("meaning", "labels"),
-    [
-        (None, ["label 1", "ignore"]),
-        ({"shaft": 1}, ["shaft", "ignore"]),
-        ({"shaft": 1, "wrist": 255}, ["shaft", "wrist"]),
-    ],
-)
-def test_an_unnamed_255_beside_other_labels_is_ignored(
-    sequence: Sequence, tmp_path: Path, meaning: dict[str, int] | None, labels: list[str]
-) -> None:
-    values = np.zeros((HEIGHT, WIDTH), np.uint8)
-    values[:10], values[10:14] = 1, 255
-    write_png(tmp_path / "left" / "001.png", values)
-    if meaning is not None:
-        (tmp_path / "left" / "labels.json").write_text(json.dumps(meaning))
-    found = read_annotations(tmp_path / "left", sequence)
-    (frame,) = found.frames
-    assert found.label_names == labels and frame.labels is not None
-    layer = ImportedMask.of(frame.labels)
-    void = ignored_labels(layer, labels)
-    assert np.array_equal(void, (values == 255) & ("ignore" in labels))
-    assert np.array_equal(layer.mask() & ~void, values > 0 if "wrist" in labels else values == 1)
-    assert any("255 beside other labels" in remark for remark in found.remarks) == ("ignore" in labels)
-
-
-def test_a_mask_of_0_and_255_remains_a_mask(sequence: Sequence, tmp_path: Path) -> None:
-    write_png(tmp_path / "left" / "001.png", disc(3) * np.uint8(255))
-    frames, labels, _ = all_of(tmp_path / "left", sequence)
-    assert labels == ["instrument"] and np.array_equal(frames[0, "left"].labels > 0, disc(3))

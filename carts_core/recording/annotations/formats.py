@@ -224,9 +224,6 @@ _DEEPEST = 4
 MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
 _INSTRUMENT = "instrument"
-_VOID = 255
-"""Value of pixels that are neither instrument nor background in label images, as of Pascal VOC."""
-_IGNORE = "ignore"
 _MAX_UNNAMED = 32
 """Maximum number of unnamed values in an image; more are artefacts of interpolation."""
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
@@ -313,7 +310,7 @@ def _parts(file: Path, meaning: Any, remarks: Counter[str], height: int, width: 
                 'one in the format of EndoVis 2018: [{"name": ..., "color": [r, g, b]}, ...].'
             )
         else:
-            yield from _by_value(image.values, names, tool, file, remarks)
+            yield from _by_value(image.values, names, tool, file)
 
 
 def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[Part]:
@@ -329,9 +326,7 @@ def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[Pa
             yield known[value], code == value
 
 
-def _by_value(
-    image: np.ndarray, names: Mapping[int, str], tool: str, file: Path, remarks: Counter[str]
-) -> Iterator[Part]:
+def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path) -> Iterator[Part]:
     values = [int(value) for value in np.unique(image) if value]
     unknown = [value for value in values if value not in names]
     if len(unknown) > _MAX_UNNAMED:
@@ -339,15 +334,7 @@ def _by_value(
             f"{file} has {len(unknown)} values without a name, {values[0]} to {values[-1]}, as after resizing with "
             "interpolation. Resize labels by nearest neighbour, or name each value in labels.json."
         )
-    ignored = _VOID if _VOID in unknown and len(values) > 1 else None
-    if ignored is not None:
-        remarks[
-            f"the value {_VOID} beside other labels is read as {_IGNORE!r}; name it in labels.json to change this"
-        ] += 1
     for value in values:
-        if value == ignored:
-            yield _IGNORE, image == value
-            continue
         name = names.get(value, f"label {value}")
         if name.lower() not in BACKGROUND:
             yield f"{tool}.{name}" if tool else name, image == value
