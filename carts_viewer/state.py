@@ -162,23 +162,17 @@ class Target:
 
     def seen(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> list[str]:
         """Cameras with an image that can be compared in a frame; if only masks are fitted, those with a mask."""
-        cameras = [name for name in cameras if index in recording.frames_of(name)]
-        if self.observed.what != "masks":
-            return cameras
-        if self.given is not None:
-            return [name for name in cameras if self.given.available(index, name)]
-        own = [name for name in cameras if recording.has_masks(name, domain)]
-        there = recording.frame(index, domain, own).masks or {}
-        return [name for name in own if name in there]
-
-    def covers(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> bool:
-        """Whether a frame has an image and, if only masks are fitted, a mask of each of its images."""
         shown = [name for name in cameras if recording.with_image([index], [name])]
         if self.observed.what != "masks":
-            return bool(shown)
+            return shown
         if self.given is not None:
-            return bool(shown) and all(self.given.available(index, name) for name in shown)
-        return bool(shown) and all(recording.has_masks(name, domain, index) for name in shown)
+            return [name for name in shown if self.given.available(index, name)]
+        return [name for name in shown if recording.has_masks(name, domain, index)]
+
+    def covers(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> bool:
+        """Whether a frame has an image, and each of its images can be compared."""
+        found = self.seen(recording, index, domain, cameras)
+        return bool(found) and len(found) == sum(bool(recording.with_image([index], [name])) for name in cameras)
 
 
 NETWORK = Target()

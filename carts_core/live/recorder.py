@@ -55,8 +55,7 @@ class Recorder:
     corrected joints, `camera_CAMERA.csv` with the poses of each camera mount, `sequence.toml`, and at the end the
     project `sequence.carts`. The images of a frame are written before its rows. If the arms are lost, the measured
     joints are written with the verdict *failed*. Files are synchronized to disk at the end, since a hard disk performs
-    few synchronizations per second; a crash of the machine may lose or damage the last
-    half minute.
+    few synchronizations per second; a crash of the machine may lose or damage the last half minute.
 
     Args:
         sequence: sequence with the arms and cameras.

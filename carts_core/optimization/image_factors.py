@@ -380,7 +380,7 @@ class LocalEdgeFactor:
     """
 
     def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor, weight: float) -> None:
-        self._factor, self._counts, self.weight = factor, counts, weight
+        self._factor, self._counts, self._weight = factor, counts, weight
         self._tangents = factor.renderer.tangents(factor.variables.around(offsets), DIFFERENCE_SPAN)
         self._render(offsets)
 
@@ -392,7 +392,7 @@ class LocalEdgeFactor:
         """The quadratic model around a point."""
         if self._outline.moved_by(offsets - self._rendered_at) > _RENDERED_ANEW:
             self._render(offsets)
-        return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self.weight)
+        return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self._weight)
 
     def cost(self) -> float:
         """Edge cost of the last rendered outlines; see `EdgeFactor.cost`."""
