@@ -147,9 +147,10 @@ class _Recovery:
     """Attempt that runs on a separate thread."""
 
     attempt: _Attempt
-    picture: Picture
-    """Thumbnail of the frame."""
-    measurement: Future[Measurement]
+    frame: Frame
+    variables: Variables
+    found: Future[tuple[Measurement, ColourModel | None]]
+    """The measurement, and the colours of the frame."""
     dropped: threading.Event
     """Event that cancels the attempt when set."""
 
@@ -348,7 +349,7 @@ class LiveTracker:
         attempt, found = self._known(errors, now), None
         if self.verdict is LiveVerdict.LOST and not found_again:
             found = self._unmeasured(frame, variables, attempt)
-        elif self.verdict is LiveVerdict.GOOD:
+        elif self.verdict is LiveVerdict.GOOD or found_again:
             found = self._settled(frame, variables, errors, now) or self._by_colours(frame, variables, attempt)
             if found is not None:
                 return found
@@ -367,14 +368,19 @@ class LiveTracker:
 
         def more() -> Measurement:
             if effort is Effort.SEARCH:
-                return search.search(frame, variables, attempt.expected, hypotheses, dropped.is_set)
+                sure, expected = self.live.sure_loss, attempt.expected
+                return search.search(frame, variables, expected, hypotheses, dropped.is_set, sure_loss=sure)
             return full.warm(frame, variables, attempt.expected, attempt.expected.mean)
+
+        def more_with_colours() -> tuple[Measurement, ColourModel | None]:
+            measurement = more()
+            return measurement, small.colours(frame, variables, measurement.correction)
 
         if effort is Effort.SEARCH:
             self._searched = now
         if self._pool is None:
             return attempt, more()
-        self._recovery = _Recovery(attempt, small_picture(frame), self._pool.submit(more), dropped)
+        self._recovery = _Recovery(attempt, frame, variables, self._pool.submit(more_with_colours), dropped)
         return found
 
     def _unmeasured(self, frame: Frame, variables: Variables, attempt: _Attempt) -> tuple[_Attempt, Measurement] | None:
@@ -450,8 +456,8 @@ class LiveTracker:
         # A search after a cancelled search runs to completion, so that fast motion does not cancel all searches.
         if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
             return
-        picture = small_picture(frame)
-        if running.picture.shape == picture.shape and change(running.picture, picture) > CHANGED:
+        before, picture = small_picture(running.frame), small_picture(frame)
+        if before.shape == picture.shape and change(before, picture) > CHANGED:
             running.dropped.set()
             self._recovery, self._searched, self._gave_up = None, -math.inf, True
 
@@ -467,14 +473,16 @@ class LiveTracker:
     def _take_recovered(self, errors: ErrorModel) -> Effort | None:
         """Use the result of a finished recovery unless a later frame was fitted; returns the effort of a used
         result."""
-        if self._recovery is None or not self._recovery.measurement.done():
+        recovery = self._recovery
+        if recovery is None or not recovery.found.done():
             return None
-        attempt, future = self._recovery.attempt, self._recovery.measurement
         self._recovery, self._gave_up = None, False
-        measurement = future.result()
+        attempt, (measurement, colours) = recovery.attempt, recovery.found.result()
         if attempt.time <= self._seen or not self._fits(attempt, measurement):
             return None
         self._take(errors, attempt, measurement)
+        solver = self._solvers[Effort.SMALL, self._moving]
+        self._colours.learn(solver, recovery.frame, recovery.variables, measurement, True, colours)
         return attempt.effort
 
     def _start_look(self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, attempt: _Attempt) -> None:

@@ -41,6 +41,8 @@ Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
 _QUICK_SCALE = 1.0
 """Maximum `Observe.scale` of a quick cold start [1]."""
+_SEARCHES = 2
+"""Maximum number of searches in one frame [1]."""
 _BLUR = 3.0
 """Blur under which a prediction from the image alone is compared [px]."""
 
@@ -151,18 +153,26 @@ class SequenceFrameSolver:
         expected: Gaussian,
         hypotheses: Sequence[np.ndarray],
         cancelled: Callable[[], bool] = lambda: False,
+        *,
+        sure_loss: float = math.inf,
     ) -> Measurement:
         """Find the correction with the cold stages alone; without information if an arm is lost (see `arm_is_lost`).
 
         Args:
             hypotheses: corrections [n] that are further candidates of `RandomRestart`.
             cancelled: see `cold`.
+            sure_loss: loss above which the search is repeated with other random states; the better result counts [1].
         """
-        prior, start = _prior(expected, variables), np.zeros(len(variables))
-        fit = self._run(frame, variables, prior, self._cold, start, cancelled, hypotheses)
-        found = self._measurement(fit, prior)
-        assert isinstance(fit.problem, FrameProblem)
-        return found.left_out() if arm_is_lost(fit.problem, _offsets(found.correction, variables)) else found
+        prior, start, found = _prior(expected, variables), np.zeros(len(variables)), []
+        for seed in range(_SEARCHES):
+            fit = self._run(frame, variables, prior, self._cold, start, cancelled, hypotheses, seed)
+            measurement = self._measurement(fit, prior)
+            assert isinstance(fit.problem, FrameProblem)
+            lost = arm_is_lost(fit.problem, _offsets(measurement.correction, variables))
+            found.append((lost, measurement.loss, measurement.left_out() if lost else measurement))
+            if not lost and measurement.loss <= sure_loss:
+                break
+        return min(found, key=lambda one: one[:2])[2]
 
     def visible(self, frame: Frame, variables: Variables, correction: np.ndarray) -> tuple[float, float]:
         """Area predicted as arms in the whole image, from the image alone, relative to the rendered area at a
@@ -306,10 +316,11 @@ class SequenceFrameSolver:
         start: np.ndarray,
         cancelled: Callable[[], bool] = lambda: False,
         hypotheses: Sequence[np.ndarray] = (),
+        seed: int = 0,
     ) -> Fit:
         problem = self._problem(frame, variables, prior)
         offsets, further = _offsets(start, variables), tuple(_offsets(one, variables) for one in hypotheses)
-        fit = Fit(problem, offsets, self._settings.iterations, hypotheses=further)
+        fit = Fit(problem, offsets, self._settings.iterations, hypotheses=further, seed=seed)
         for _ in run_stages(stages, fit):
             if cancelled():
                 raise CancelledError

@@ -97,6 +97,8 @@ class Fit:
     """Quadratic model of the edge factor around the estimate, after `AlignEdges`."""
     hypotheses: tuple[Float[Tensor, " n"], ...] = ()
     """Further candidates of `RandomRestart`."""
+    seed: int = 0
+    """Seed of the random states of `RandomRestart`."""
     restarts: int = 0
     """Number of jumps of the estimate; after the first one, descents use a smaller tolerance."""
     used: int = 0
@@ -281,7 +283,7 @@ def run_random_restart(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
     """Continue from the best of random points if the loss is high or an arm is lost."""
     problem = _one_frame(fit)
     if fit.loss >= stage.if_loss or arm_is_lost(problem, fit.offsets):
-        fit.jump_to(best_random_start(problem, fit.offsets, stage, fit.hypotheses))
+        fit.jump_to(best_random_start(problem, fit.offsets, stage, fit.hypotheses, fit.seed))
         yield from run_stages(stage.then, fit)
 
 

@@ -89,6 +89,8 @@ class LiveSettings(Ranged):
     in synthetic images of 40 occluders, and at least 0.62 in images of arms 5 degrees off."""
     bad_loss: Annotated[float, Range(1e-3, 10)] = 0.06
     """Loss above which a fit is bad [1]."""
+    sure_loss: Annotated[float, Range(1e-3, 10)] = 0.03
+    """Loss of a search above which it is repeated with other random states [1]."""
     bad_factor: Annotated[float, Range(1, 100)] = 2.5
     """Multiple of the usual loss above which a fit is also bad [1]; this bound is at least half of `bad_loss`."""
     lost_seconds: Seconds = 0.25

@@ -303,7 +303,9 @@ LIVE_SEARCH: tuple[Stage, ...] = (
     SETTLE[0],
     _MEDIUM,
     _FINE,
-    *SETTLE[1:],
+    # The frames after a search converge (`SETTLE`).
+    replace(FINEST, steps=2),
+    SETTLE[-1],
 )
 """Stages for a frame of a live stream with lost arms, under a prior that is wider than that of other frames."""
 

@@ -228,6 +228,31 @@ def test_frames_after_a_search_are_measured_until_it_has_converged(
     assert live.search not in used[1:] and live.settle not in used[1 + live.settle_frames :]
 
 
+@pytest.mark.parametrize("sure", [True, False])
+def test_a_search_that_is_not_sure_is_repeated_and_the_better_result_counts(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch, sure: bool
+) -> None:
+    seeds: list[int] = []
+    run = SequenceFrameSolver._run
+
+    def first_is_wrong(solver: SequenceFrameSolver, *arguments: Any) -> Any:
+        fit = run(solver, *arguments)
+        if arguments[3] == stream.tracker.live.search:
+            seeds.append(arguments[-1])
+            if len(seeds) == 1 and not sure:
+                known = fit.best_of_descent
+                assert known is not None
+                evaluation = replace(known.evaluation, stage_loss=2.0 * stream.tracker.live.sure_loss)
+                fit.best_of_descent = replace(known, offsets=known.offsets + 0.1, evaluation=evaluation)
+        return fit
+
+    monkeypatch.setattr(SequenceFrameSolver, "_run", first_is_wrong)
+    verdict, effort, error = stream.next()
+    assert (verdict, effort) == (LiveVerdict.GOOD, Effort.SEARCH)
+    assert seeds == ([0] if sure else [0, 1])
+    assert error < 1.0, "the wrong result is 5.7 degrees off"
+
+
 def test_a_camera_that_moves_is_followed(stream: Stream) -> None:
     stream.next()
     T = np.array(stream.sequence.scene.cameras[0].T_camera_world)
