@@ -1,6 +1,7 @@
 """Tabs: the queue of intents, the state and view of each tab, and the state that all tabs share."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -169,6 +170,8 @@ class Tab:
         self.session = session
         self._shown: ViewState | None = None
         self._pictured: ViewState | None = None
+        self._panels_at = -math.inf
+        """Time of the last update of the widgets [s, monotonic]."""
         self._scored = True
         self._left_at: float | None = None
         """Time at which the page was closed [s, monotonic]; None while the page is open and after the run was ended."""
@@ -195,7 +198,7 @@ class Tab:
         state, session = self.controller.state, self.session
         self.view = View(client, session, renderer, storage, state, self.put, self.waits, scene_shown=hello.scene)
         self._shown = self._pictured = self._left_at = None
-        self._gone = False
+        self._panels_at, self._gone = -math.inf, False
 
     def detach(self) -> None:
         """Detach the closed page; the run continues for `RECONNECT_TIME`."""
@@ -222,11 +225,17 @@ class Tab:
         """Whether a page shows a picture of this tab."""
         return self.view is not None and self._pictured is not None
 
-    def picture_wait(self) -> float | None:
-        """Time until the next picture is due [s]; None if none is due."""
-        if self.view is None or self._pictured is self.controller.state:
+    def show_wait(self) -> float | None:
+        """Time until the page takes a changed state [s]; None if it shows the current one."""
+        state, display = self.controller.state, None if self.view is None else self.view.display
+        if display is None or (self._pictured is state and self._shown is state):
             return None
-        return self.view.display.ready_in()
+        ready = display.ready_in()
+        return ready if self._shown is state else min(ready, self._panels_wait())
+
+    def _panels_wait(self) -> float:
+        """Time after which widgets are updated also if a picture is not acknowledged [s]."""
+        return max(0.0, self._panels_at + _PANELS_WAIT - time.monotonic())
 
     def show_picture(self, attempt: Callable[[Callable[[], None]], None]) -> None:
         """Show a changed picture if it is due; `attempt` calls a function and shows its errors."""
@@ -249,7 +258,8 @@ class Tab:
             self._scored = True
             if pictured:
                 self._pictured = self.controller.state
-        self.show_panels(attempt)
+        if self.view is None or self.view.display.ready_in() == 0.0 or self._panels_wait() == 0.0:
+            self.show_panels(attempt)
 
     def show_panels(self, attempt: Callable[[Callable[[], None]], None]) -> None:
         """Update the widgets; `attempt` as in `show_picture`."""
@@ -257,6 +267,7 @@ class Tab:
         if self._shown is not state:
             if view is not None:
                 attempt(lambda: view.display.show_panels(state))
+                self._panels_at = time.monotonic()
             # Set also after an error, which would otherwise recur endlessly.
             self._shown = self.controller.state
 
@@ -272,6 +283,9 @@ class Tab:
             self.session.close()
 
 
+_PANELS_WAIT = 0.25
+"""Time between updates of the widgets while a picture is not acknowledged [s]. A slow page handles messages in order,
+so more updates would delay its pictures."""
 _MAX_CLOSED_TABS = 8
 """Maximum number of tabs that are kept after their pages were closed."""
 

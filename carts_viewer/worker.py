@@ -185,10 +185,10 @@ class Worker:
             self._rest.notify_all()
 
     def _wait_time(self) -> float | None:
-        """Time to wait for an intent [s]: 0 while there is work, at most until a page can take its next picture."""
+        """Time to wait for an intent [s]: 0 while there is work, at most until a page takes a changed state."""
         waits = [self._tabs.job_runner.wait_time()]
         for tab in self._tabs:
-            waits += [tab.controller.wait_time(), tab.picture_wait()]
+            waits += [tab.controller.wait_time(), tab.show_wait()]
         return min((wait for wait in waits if wait is not None), default=None)
 
     def _publish(self) -> None:

@@ -206,35 +206,46 @@ def _draw_paint(
 
 
 FIRST_WAIT = 0.08
-"""Time after which the next picture is sent if the last one is not acknowledged [s]."""
-LONGEST_WAIT = 2.0
-"""The same time after several pictures that were not acknowledged [s]."""
+"""Least time after which the next picture is sent if the last one is not acknowledged [s]."""
+LONGEST_WAIT = 5.0
+"""Longest such time [s]."""
+_MARGIN = 1.5
+"""This time, relative to that from sending to acknowledging the last acknowledged picture [1]."""
 
 
 class RateLimit:
     """Decides when the next picture may be sent: once the tab has drawn the last picture, or after a wait.
 
-    The wait doubles with each unacknowledged picture, since a slow tab needs longer to draw one, and a slow connection
-    longer to transmit it.
+    An image that is replaced while it is loaded is never drawn. The wait is therefore longer than the tab needed for
+    the last acknowledged picture, and doubles with each unacknowledged one.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._sent_at, self._wait = float("-inf"), FIRST_WAIT
+        self._wait = FIRST_WAIT
+        self._sent_at = {0: float("-inf")}
+        """Times [s] of the last acknowledged picture and of later ones, by number."""
         self._sent = self._drawn = 0
         """Numbers of the last sent picture, and of the last acknowledged one."""
 
     def sent(self) -> int:
         """Record that a picture is sent; returns its number."""
-        self._wait = FIRST_WAIT if self._drawn == self._sent else min(2.0 * self._wait, LONGEST_WAIT)
-        self._sent_at = self._clock()
+        if self._drawn != self._sent:
+            self._wait = min(2.0 * self._wait, LONGEST_WAIT)
+        self._sent_at[self._sent + 1] = self._clock()
         self._sent += 1
         return self._sent
 
     def drawn(self, number: int) -> None:
         """Record that the tab has drawn the picture with this number. Thread-safe."""
-        self._drawn = number
+        if self._drawn < number <= self._sent:
+            needed = self._clock() - self._sent_at[number]
+            self._wait = min(max(_MARGIN * needed, FIRST_WAIT), LONGEST_WAIT)
+            for earlier in range(self._drawn, number):
+                del self._sent_at[earlier]
+            self._drawn = number
 
     def ready_in(self) -> float:
         """Time until the next picture may be sent [s]."""
-        return 0.0 if self._drawn == self._sent else max(0.0, self._sent_at + self._wait - self._clock())
+        sent = self._sent
+        return 0.0 if self._drawn == sent else max(0.0, self._sent_at[sent] + self._wait - self._clock())

@@ -1,12 +1,16 @@
 """The picture in headless Chromium, with real pixels: views, the overlay's place, and edits by mouse in the picture."""
 
+import itertools
 import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect
-from viewer_tab import MARKERS, Hand, OpenTab, Tab, box_of, decoded
+from playwright.sync_api import Browser, expect
+from viewer_tab import MARKERS, Hand, OpenTab, OpenViewer, Tab, box_of, decoded, new_context
 from waiting import eventually, wait_in
 
 from carts_core.model.keypoints import project_keypoints
@@ -280,6 +284,13 @@ def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(open_tab: Ope
     assert tab.page.evaluate(width) == pytest.approx(before, abs=0.5)
 
 
+_SLOW_LOADING = """(() => {
+  const { get, set } = Object.getOwnPropertyDescriptor(HTMLImageElement.prototype, 'src');
+  Object.defineProperty(HTMLImageElement.prototype, 'src', {
+    get,
+    set(address) { setTimeout(() => set.call(this, address), String(address).startsWith('blob:') ? 400 : 0); },
+  });
+})()"""
 _NOTE_EXPECTED = """() => {
   const { expectPicture } = carts;
   window.expected = [];
@@ -287,6 +298,39 @@ _NOTE_EXPECTED = """() => {
 }"""
 _DRAWN = """window.sent.filter((text) => text.includes('Drawn'))
   .map((text) => JSON.parse(JSON.parse(text).updates.value)[2].picture)"""
+
+
+def test_a_page_that_loads_pictures_slowly_shows_some_of_them_during_playback(
+    browser: Browser, open_viewer: OpenViewer
+) -> None:
+    app = open_viewer(frames=3, marked=True)
+    with closing(new_context(browser)) as context:
+        context.add_init_script("localStorage.setItem('carts-tour', 'seen')")
+        context.add_init_script(_SLOW_LOADING)
+        tab = Tab(app, context.new_page())
+        tab.page.goto(app.url)
+        tab.wait_until_ready()
+        place, stopped, drawn = tab.place_in_viewer, threading.Event(), set()
+
+        def play() -> None:
+            for step in itertools.count():
+                place.put(intents.ShowFrame(step % 3))
+                place.put(intents.SetOpacity(0.4 + 0.01 * (step % 50)))
+                if stopped.wait(0.02):
+                    return
+
+        def seen() -> int:
+            drawn.add(tab.page.evaluate("carts.drawnOverlay()"))
+            return len(drawn)
+
+        with ThreadPoolExecutor(1) as threads:
+            threads.submit(play)
+            try:
+                eventually(seen, lambda count: count > 2)
+            finally:
+                stopped.set()
+        app.wait_until_shown()
+        eventually(lambda: place.view and place.view.display.ready_in() == 0.0)
 
 
 def test_each_picture_is_acknowledged_also_where_an_image_stays_the_same(open_tab: OpenTab) -> None:

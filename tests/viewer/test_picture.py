@@ -93,20 +93,39 @@ def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -
     assert limit.ready_in() == 0.0
 
 
-def test_a_tab_that_draws_slowly_gets_fewer_pictures_until_it_has_drawn_the_last_one() -> None:
+@pytest.mark.parametrize("loading", [0.4, 3.0])
+def test_a_tab_that_draws_slowly_gets_as_many_pictures_as_it_can_draw(loading: float) -> None:
     now = [100.0]
     limit = RateLimit(lambda: now[0])
-    waits, number = [], 0
-    for _ in range(8):
-        number = limit.sent()
-        waits.append(limit.ready_in())
-        # The last picture is on its way for longer than the one before.
-        limit.drawn(number - 1)
-        assert limit.ready_in() == waits[-1]
-        now[0] += waits[-1]
+    drawn = []
+    while len(drawn) < 4:
+        number, wait = limit.sent(), limit.ready_in()
+        if wait > loading:  # An image that is replaced while it is loaded is never drawn.
+            now[0] += loading
+            limit.drawn(number)
+            drawn.append(now[0])
+        else:
+            now[0] += wait
         assert limit.ready_in() == 0.0
-    assert waits == pytest.approx([FIRST_WAIT * 2**count for count in range(5)] + 3 * [LONGEST_WAIT])
+    assert drawn[0] < 100.0 + 5.0 * loading
+    assert np.diff(drawn) == pytest.approx(loading), "no picture is lost once the time that one needs is known"
+
+
+def test_the_wait_has_bounds_and_a_fast_picture_ends_it() -> None:
+    now = [100.0]
+    limit = RateLimit(lambda: now[0])
+    waits = []
+    for _ in range(9):
+        limit.sent()
+        waits.append(limit.ready_in())
+        now[0] += waits[-1]
+    assert waits == pytest.approx([FIRST_WAIT * 2**count for count in range(6)] + 3 * [LONGEST_WAIT])
+    number = limit.sent()
+    limit.drawn(number - 1)
+    assert limit.ready_in() == LONGEST_WAIT, "the last picture is on its way, and the one before it needed as long"
+    now[0] += 0.02
     limit.drawn(number)
+    assert limit.ready_in() == 0.0
     limit.sent()
     assert limit.ready_in() == pytest.approx(FIRST_WAIT)
 
