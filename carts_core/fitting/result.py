@@ -217,10 +217,10 @@ class Fit:
 
     def _arm_ids(self, state: SceneState) -> np.ndarray:
         """Arm index per pixel of `image`, or -1."""
-        ids = Renderer(self.scene).segment(state.to("cpu"))[0]
+        ids = Renderer(self.scene, window=self.camera.recorded_window).segment(state.to("cpu"))[0]
         if not any(self.camera.distortion):
             return ids
-        recorded = np.full_like(ids, -1)
+        recorded = np.full((self.camera.height, self.camera.width), -1, ids.dtype)
         for index in range(len(self.scene.arms)):
             recorded[self.camera.distorted_mask(ids == index)] = index
         return recorded

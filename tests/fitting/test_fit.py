@@ -4,6 +4,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,12 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from tiny import tiny_images, tiny_scene
+from tiny import recorded_mask, tiny_images, tiny_scene
 
 import carts_core as carts
 from carts_core.errors import CartsError, RobotError, SequenceError, SettingsError
 from carts_core.evaluation import dice
 from carts_core.export import mask_png
-from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.optimization import Verdict
 from carts_core.recording import Sequence
@@ -174,12 +174,15 @@ def test_a_camera_has_its_own_size_and_convention(tiny: dict[str, Any], fitted: 
         fitted_with(tiny, K=fitted.camera.resized(64, 48))
 
 
-def test_with_distortion_the_mask_belongs_to_the_given_image(tiny: dict[str, Any], fitted: carts.Fit) -> None:
+def test_with_distortion_the_mask_belongs_to_the_given_image_to_its_border(
+    tiny: dict[str, Any], fitted: carts.Fit, shipped_psm: Robot
+) -> None:
     distortion = (-0.25, 0.05, 0.0, 0.0)
-    recorded = Camera("camera", WIDTH, HEIGHT, fitted.camera.intrinsics, np.eye(4), distortion)
-    mask = recorded.distorted_mask(tiny["mask"])
+    known = tiny_scene(shipped_psm, 1, ("left",), WIDTH, HEIGHT)
+    recorded = replace(known.scene.cameras[0], distortion=distortion)
+    mask = recorded_mask(known.scene, known.scene.state({"PSM1": known.truth[0]}), recorded)
     found = fitted_with(tiny, mask=mask, distortion=distortion)
-    assert dice(found.mask, mask) > 0.998 and dice(mask, tiny["mask"]) < 0.992
+    assert dice(found.mask, mask) > 0.998 and dice(recorded.distorted_mask(tiny["mask"]), mask) < 0.995
     assert found.camera.distortion == distortion and found.scene.cameras[0].distortion == ()
 
 
