@@ -89,7 +89,7 @@
     return [low - room, high + room];
   }
 
-  function drawCurve(context, { view, xOf, top, height, ink, w, here }) {
+  function drawCurve(context, { view, xOf, top, height, ink, w }) {
     ask(view, Math.floor(w));
     context.font = "11px system-ui, sans-serif";
     const ends = curve?.name === chosen ? limits() : null;
@@ -115,9 +115,21 @@
       });
       context.stroke();
     });
+  }
+
+  /** The ends of the curve's axis, and its value at the current frame. */
+  function drawCurveLabels(context, { xOf, top, height, ink, w, here }) {
+    const ends = curve?.name === chosen ? limits() : null;
+    if (!ends) return;
+    const yOf = (value) => top + height - ((value - ends[0]) / (ends[1] - ends[0])) * height;
     context.fillStyle = ink;
-    context.fillText(String(Number(ends[1].toPrecision(4))), 4, top + 9);
-    context.fillText(String(Number(ends[0].toPrecision(4))), 4, top + height - 2);
+    context.font = "11px system-ui, sans-serif";
+    const right = xOf(here + 0.5) < 110; // the axis is opposite the value
+    context.textAlign = right ? "end" : "start";
+    const x = right ? w - 4 : 4;
+    context.fillText(String(Number(ends[1].toPrecision(4))), x, top + 9);
+    context.fillText(String(Number(ends[0].toPrecision(4))), x, top + height - 2);
+    context.textAlign = "start";
     drawValue(context, here, { xOf, yOf, ink, w });
   }
 
@@ -155,7 +167,7 @@
 
   Object.assign(window.carts, {
     lanes: {
-      drawThumbnails, drawCurve, valueAt,
+      drawThumbnails, drawCurve, drawCurveLabels, valueAt,
       onChange: (callback) => { drawAgain = callback; },
       chosen: () => chosen,
       choose(name) { chosen = name; localStorage.setItem("carts-curve", name); asked = ""; drawAgain(); },

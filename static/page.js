@@ -266,7 +266,7 @@
         <button data-do="out" title="Zoom out" aria-label="Zoom out" data-icon="minus"></button><output aria-label="Zoom"></output>
         <button data-do="in" title="Zoom in (wheel over the image)" aria-label="Zoom in" data-icon="plus"></button>
       </span>
-      <button data-do="fit" title="Show the whole image" aria-label="Fit" data-icon="maximize"></button>
+      <button data-do="fit" title="Fit: show the whole image" aria-label="Fit" data-icon="maximize"></button>
       <span class="carts-layers">
         <button data-do="ghost" title="Show the measured arms, semi-transparent">Measured</button>
         <button data-do="grid" title="Show the grid: 1 cm, with strong lines every 5 cm">Grid</button>

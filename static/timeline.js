@@ -225,12 +225,14 @@
         context, { ...lane, top: TICKS, height: PICTURES - 2 }, { camera, domain, aspect: known.aspects[camera] ?? 4 / 3 });
     }
     drawBars(context, ink, w);
-    if (curveHigh()) window.carts.lanes.drawCurve(context, { ...lane, top: curveAt() + 1, height: CURVE - 3 });
+    const curve = { ...lane, top: curveAt() + 1, height: CURVE - 3 };
+    if (curveHigh()) window.carts.lanes.drawCurve(context, curve);
     if (solving) {
       context.fillStyle = light ? "rgba(15, 118, 110, 0.18)" : "rgba(45, 212, 167, 0.18)";
       context.fillRect(xOf(solving[0]), barsAt(), xOf(solving[0] + solving[1]) - xOf(solving[0]), BARS);
     }
     drawRange(context, light, w);
+    if (curveHigh()) window.carts.lanes.drawCurveLabels(context, curve);
     drawWhole(context, w, h, light);
     drawHere(context, light);
     say();
@@ -264,8 +266,8 @@
     if (!range) return;
     const [left, right] = [xOf(range[0]), xOf(range[1] + 1)];
     context.fillStyle = light ? "rgba(248, 250, 252, 0.72)" : "rgba(10, 12, 13, 0.66)";
-    context.fillRect(0, 0, Math.max(left, 0), wholeAt());
-    context.fillRect(right, 0, Math.max(w - right, 0), wholeAt());
+    context.fillRect(0, TICKS, Math.max(left, 0), wholeAt() - TICKS);
+    context.fillRect(right, TICKS, Math.max(w - right, 0), wholeAt() - TICKS);
     context.fillStyle = "#f59e0b";
     context.fillRect(left, 0, 2, wholeAt());
     context.fillRect(right - 2, 0, 2, wholeAt());

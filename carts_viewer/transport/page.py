@@ -92,9 +92,11 @@ class TabPage:
         if icons:
             labels = ", ".join(f"[id='{element_id(handle)}'] .mantine-Button-label" for handle in icons)
             sections = labels.replace("-label", "-section")
+            buttons, pictures = (labels.replace(" .mantine-Button-label", part) for part in ("", " svg"))
             self.gui.add_html(
                 f"<style>{labels} {{ position: absolute; width: 1px; height: 1px; overflow: hidden; "
-                f"clip-path: inset(50%) }} {sections} {{ margin: 0 }}</style>"
+                f"clip-path: inset(50%) }} {sections} {{ margin: 0 }} {buttons} {{ padding-inline: 0 !important }} "
+                f"{pictures} {{ left: 0 !important }}</style>"
             )
 
     def columns(self, handles: Sequence[Any], count: int = 2, *, narrow_labels: bool = False) -> None:

@@ -111,6 +111,8 @@ class DraftSummary:
 
     key: str
     name: str
+    source: str
+    """Folder or file that is imported."""
     changed: float
     """Time of the last change [s since 1970]."""
 
@@ -151,10 +153,11 @@ def drafts() -> list[DraftSummary]:
     for path in _folder().glob("*.json"):
         try:
             plain = parse_json(read_text(path, SETTINGS))
-            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)[:_MAX_NAME]
-            found.append(DraftSummary(path.stem, name, path.stat().st_mtime))
+            source = str(plain.get("source", ""))
+            name = str(plain.get("name") or Path(source).name)[:_MAX_NAME]
+            found.append(DraftSummary(path.stem, name, source, path.stat().st_mtime))
         except (CartsError, OSError, ValueError, AttributeError):
-            found.append(DraftSummary(path.stem, "damaged import", time.time()))
+            found.append(DraftSummary(path.stem, "damaged import", "", time.time()))
     return sorted(found, key=lambda draft: -draft.changed)
 
 

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
 from carts_core.optimization import StopReason
@@ -43,6 +45,8 @@ from carts_viewer.wizard.drawing import Drawing, drawing_of
 from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras
 
 _OPACITY = 0.9
+_AWAY = 1e6
+"""Distance at which an arm is smaller than a pixel [m]."""
 
 
 class FramePicture:
@@ -57,14 +61,17 @@ class FramePicture:
         state = sequence.scene.state(frame.measured, None, frame.mounts)
         self._view = SceneView(page.server.scene, sequence.scene, state, sequence.scene.cameras[0].name)
 
-    def show(self, index: int, camera: str, scene: Scene | None) -> None:
-        """Show a frame of a camera, with the contours of a calibrated scene."""
+    def show(self, index: int, camera: str, scene: Scene | None, placeholders: Rows[str]) -> None:
+        """Show a frame of a camera, with the contours of a calibrated scene but not of arms with a placeholder pose."""
         frame = self._sequence.frame(index, cameras=[camera])
         own = self._sequence.scene.camera(camera)
         if scene is None:
             picture = layers.transparent(own.height, own.width)
         else:
-            ids = self._renderer.arm_ids(scene.state(frame.measured, None, frame.mounts), camera)
+            state = scene.state(frame.measured, None, frame.mounts)
+            T_world_base = np.array(state.T_world_base)
+            T_world_base[[arm.name in placeholders for arm in scene.arms], :3, 3] = _AWAY
+            ids = self._renderer.arm_ids(replace(state, T_world_base=T_world_base), camera)
             picture = layers.contour(ids, _OPACITY)
         with self._page.server.atomic():
             if self._shown != (index, camera):
@@ -185,7 +192,8 @@ class HandEyeStep:
         self._solve(draft)
         prompt = self.prompt(draft)
         at = prompt or (self._clicking.plan[0] if not draft.points else ClickPrompt.of(draft.points[-1]))
-        self._picture.show(at.frame, at.camera, self.shown_scene(draft))
+        placeholders = self._placeholders(draft)
+        self._picture.show(at.frame, at.camera, self.shown_scene(draft), placeholders)
         content = hand_eye_panel(
             draft,
             self._clicking,
@@ -195,7 +203,7 @@ class HandEyeStep:
             self._progress,
             self.problem,
             self._target(draft),
-            self._placeholders(draft),
+            placeholders,
             undoable,
         )
         self._host.document.show(content, "side")

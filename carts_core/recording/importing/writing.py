@@ -195,7 +195,7 @@ def _with_intrinsics(camera: FoundCamera, job: Import) -> FoundCamera:
     width, height = camera.size
     focal = FOCAL_WIDTHS * width
     job.missing(
-        f"no calibration; a focal length of {focal:.0f} px is a placeholder.",
+        f"no calibration; a placeholder focal length of {focal:.0f} px is used.",
         camera.name,
         remedy=f"Give --calibration {camera.name} FILE, or estimate it with carts calibrate.",
         placeholder="intrinsics",
@@ -219,7 +219,7 @@ def _placed(arm: FoundArm, number: int, job: Import) -> FoundArm:
     T[:3, :3] = turn[0].as_matrix()
     T[:3, 3] = [0.0, 0.0, max(_DISTANCE, 0.5 * float(np.linalg.norm(tip)))] - T[:3, :3] @ tip
     job.missing(
-        "no base frame (hand-eye calibration); a pose in front of the camera is a placeholder.",
+        "no base frame (hand-eye calibration); a placeholder pose in front of the camera is used.",
         arm.name,
         remedy=f"Give --base {arm.name} FILE, or place the arm in carts view and refine with carts calibrate.",
         placeholder="T_world_base",
