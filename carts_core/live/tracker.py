@@ -148,6 +148,8 @@ class _Recovery:
 
     attempt: _Attempt
     frame: Frame
+    picture: Picture
+    """Thumbnail of the frame."""
     variables: Variables
     found: Future[tuple[Measurement, ColourModel | None]]
     """The measurement, and the colours of the frame."""
@@ -380,7 +382,8 @@ class LiveTracker:
             self._searched = now
         if self._pool is None:
             return attempt, more()
-        self._recovery = _Recovery(attempt, frame, variables, self._pool.submit(more_with_colours), dropped)
+        running = self._pool.submit(more_with_colours)
+        self._recovery = _Recovery(attempt, frame, small_picture(frame), variables, running, dropped)
         return found
 
     def _unmeasured(self, frame: Frame, variables: Variables, attempt: _Attempt) -> tuple[_Attempt, Measurement] | None:
@@ -456,8 +459,8 @@ class LiveTracker:
         # A search after a cancelled search runs to completion, so that fast motion does not cancel all searches.
         if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
             return
-        before, picture = small_picture(running.frame), small_picture(frame)
-        if before.shape == picture.shape and change(before, picture) > CHANGED:
+        picture = small_picture(frame)
+        if running.picture.shape == picture.shape and change(running.picture, picture) > CHANGED:
             running.dropped.set()
             self._recovery, self._searched, self._gave_up = None, -math.inf, True
 

@@ -154,14 +154,15 @@ class SequenceFrameSolver:
         hypotheses: Sequence[np.ndarray],
         cancelled: Callable[[], bool] = lambda: False,
         *,
-        sure_loss: float = math.inf,
+        sure_loss: float,
     ) -> Measurement:
         """Find the correction with the cold stages alone; without information if an arm is lost (see `arm_is_lost`).
 
         Args:
             hypotheses: corrections [n] that are further candidates of `RandomRestart`.
             cancelled: see `cold`.
-            sure_loss: loss above which the search is repeated with other random states; the better result counts [1].
+            sure_loss: loss above which the search is repeated with other random states, as it is if an arm is lost;
+                the better result counts [1].
         """
         prior, start, found = _prior(expected, variables), np.zeros(len(variables)), []
         for seed in range(_SEARCHES):

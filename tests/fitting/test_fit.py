@@ -182,7 +182,7 @@ def test_with_distortion_the_mask_belongs_to_the_given_image_to_its_border(
     recorded = replace(known.scene.cameras[0], distortion=distortion)
     mask = recorded_mask(known.scene, known.scene.state({"PSM1": known.truth[0]}), recorded)
     found = fitted_with(tiny, mask=mask, distortion=distortion)
-    assert dice(found.mask, mask) > 0.998 and dice(recorded.distorted_mask(tiny["mask"]), mask) < 0.995
+    assert dice(found.mask, mask) > 0.998 and dice(recorded.distorted_mask(tiny["mask"]), mask) < 0.992
     assert found.camera.distortion == distortion and found.scene.cameras[0].distortion == ()
 
 

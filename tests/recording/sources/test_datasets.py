@@ -180,4 +180,4 @@ def test_a_broken_recording_is_an_error_in_words(tmp_path, name):
 def test_endovis_without_a_calibration_gets_a_stand_in(tmp_path):
     path = endovis(tmp_path / "seq_1")
     (path / "camera_calibration.txt").unlink()
-    assert any("placeholder" in str(note) for note in find(path).notes)
+    assert any("a placeholder focal length" in str(note) for note in find(path).notes)
