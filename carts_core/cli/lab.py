@@ -140,7 +140,7 @@ class BaselineOptions(BaselineNetwork):
 
 @dataclass(frozen=True)
 class Baseline:
-    """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; rerun the command to resume."""
+    """Train one of the networks of `carts bench --baselines`; rerun the command to resume."""
 
     output: Annotated[Path, tyro.conf.Positional]
     """Folder for checkpoints and weights."""

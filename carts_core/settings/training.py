@@ -366,8 +366,8 @@ ADAPTATION_SETTINGS = TrainingConfig(
 """Default settings of an adaptation to a recording. `steps` is no limit; without `minutes`, the limit is lower."""
 
 
-BaselineName = Literal["unet", "hrnet", "swin", "colleoni"]
-"""Baseline network. Three baselines use only the image; Colleoni's network also uses a rendering of the kinematics."""
+BaselineName = Literal["unet", "hrnet", "swin", "efficientnet", "colleoni"]
+"""Baseline network. All use only the image, except Colleoni's network, which also uses a rendering of the kinematics."""
 Augmentation = Literal["none", "smoke", "autoaugment", "elastic", "projective"]
 """Augmentation of training images in addition to mirroring: simulated smoke (as in the paper), or an augmentation
 compared by SegSTRONG-C."""
@@ -375,6 +375,7 @@ compared by SegSTRONG-C."""
 _ENCODERS: dict[BaselineName, str] = {
     "hrnet": "hrnet_w18_small",
     "swin": "swin_tiny_patch4_window7_224",
+    "efficientnet": "tf_efficientnet_lite0",
     "colleoni": "resnet10t",
 }
 _ENCODER = re.compile(r"[a-z0-9_]{1,80}")
@@ -389,8 +390,8 @@ class BaselineNetwork:
     """Baseline network."""
     encoder: str = ""
     """Encoder name in timm; by default a small encoder of the architecture: `hrnet_w18_small`,
-    `swin_tiny_patch4_window7_224` or `resnet10t` (two encoders, for Colleoni's). The paper uses `hrnet_w48`; the U-Net
-    takes no encoder."""
+    `swin_tiny_patch4_window7_224`, `tf_efficientnet_lite0` or `resnet10t` (two encoders, for Colleoni's). The paper
+    uses `hrnet_w48`; the U-Net takes no encoder."""
     width: int | None = None
     """Channels of the first stage of a Swin transformer; by default as in the encoder (96 for tiny)."""
     decoder: tuple[int, ...] = (64, 48, 32, 24, 16)

@@ -177,7 +177,13 @@ METHODS = {
     "temporal": Method("TC-CaRTS, its temporal pipeline", DescentSolver.paper, as_sequence=True),
     "masks": Method("ours, masks as target", _ours, masks_given=True),
 }
-_NETWORKS: dict[BaselineName, str] = {"unet": "U-Net", "hrnet": "HRNet", "swin": "Swin", "colleoni": "Colleoni's"}
+_NETWORKS: dict[BaselineName, str] = {
+    "unet": "U-Net",
+    "hrnet": "HRNet",
+    "swin": "Swin",
+    "efficientnet": "EfficientNet",
+    "colleoni": "Colleoni's",
+}
 _AUGMENTATIONS: dict[Augmentation, str] = {
     "none": "no augmentation",
     "smoke": "simulated smoke",

@@ -27,6 +27,7 @@ from carts_core.settings.training import Augmentation, BaselineName, BaselineNet
 SMALLEST = {
     "unet": {"unet": Architecture(widths=(4, 6, 8, 8, 8), local_mean=False)},
     "hrnet": {"decoder": (8, 8, 8, 8, 8)},
+    "efficientnet": {"decoder": (8, 8, 8, 8, 8)},
     "swin": {"width": 12, "decoder": (8, 8, 8, 8, 8)},
     "colleoni": {"decoder": (8, 8, 8, 8, 8)},
 }
@@ -50,7 +51,7 @@ class _Frames(TrainingFrames):
 
 
 @pytest.mark.parametrize(
-    "name", ["colleoni", *(pytest.param(name, marks=pytest.mark.slow) for name in ("unet", "hrnet", "swin"))]
+    "name", ["colleoni", *(pytest.param(name, marks=pytest.mark.slow) for name in ("unet", "hrnet", "swin", "efficientnet"))]
 )
 def test_networks_train_save_and_load(name: BaselineName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.lab.baselines.training.VALIDATION", 4)
