@@ -3,7 +3,7 @@
 import csv
 import signal
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import torch
 from tiny import TinyImage, TinyScene, tiny_images, tiny_scene
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 from carts_core.model.robot import Robot
 from carts_core.networks import FeatureExtractor
@@ -24,6 +26,26 @@ ROOT = Path(__file__).resolve().parents[1]
 # A shell that runs the tests in the background or under nohup has them ignore these, and so do the commands they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+class _BrowserTestsInOneProcess(LoadFileScheduling):
+    """Tests of a file run in one process, and all browser tests in the same one: browsers that draw at the same time
+    slow each other down."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        scope = super()._split_scope(nodeid)
+        return "browser" if _has_browser_tests(self.config.rootpath / scope) else scope
+
+
+@cache
+def _has_browser_tests(file: Path) -> bool:
+    return "mark.browser" in file.read_text()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFileScheduling | None:
+    """Use the scheduler above with `--dist loadfile`."""
+    return _BrowserTestsInOneProcess(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -131,7 +131,7 @@ def measure_hour(path: Path, moves: int) -> Hour:
     with (
         tempfile.TemporaryDirectory() as folder,
         ViewerApp.open(path, project=Path(folder) / "bench.carts", port=0) as app,
-        RawTab(app.url, draws=True, keep=4, key="bench") as tab,
+        RawTab(app.url, keep=4, key="bench") as tab,
     ):
         _wait(lambda: len(tab.overlays) > 0)
         opened, worked = time.perf_counter() - began, time.process_time() - worked

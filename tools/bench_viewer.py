@@ -111,7 +111,7 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
     count = min(frames, len(app.sequence)) - 1
     app.queue.put(intents.ShowFrame(0))
     times: list[float] = []
-    with RawTab(app.url, draws=True, key=_KEY) as tab:
+    with RawTab(app.url, key=_KEY) as tab:
         app.wait_until_shown()
         keys = {1: tab.command("Next frame"), -1: tab.command("Previous frame (back)")}
         lap = [1] * count + [-1] * count

@@ -114,7 +114,7 @@ class Soaking:
         return self.seen
 
     def _open(self, key: str) -> RawTab:
-        return RawTab(self._app.url, draws=True, keep=1, key=key).__enter__()
+        return RawTab(self._app.url, keep=1, key=key).__enter__()
 
     def _place(self, tab: RawTab) -> Tab:
         return next(place for place in self._app.tabs if place.key == tab.key)

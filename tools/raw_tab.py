@@ -42,7 +42,7 @@ class RawTab:
         self,
         url: str,
         *,
-        draws: bool = False,
+        draws: bool = True,
         keep: int | None = None,
         origin: str | None = None,
         hello: bool = True,

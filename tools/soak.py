@@ -106,7 +106,7 @@ class RandomTab:
 
     def __init__(self, url: str, key: str, dice: random.Random) -> None:
         self._dice, self._count = dice, 0
-        self.tab = RawTab(url, draws=True, keep=1, key=key).__enter__()
+        self.tab = RawTab(url, keep=1, key=key).__enter__()
 
     def act(self, kind: str, frames: int) -> None:
         """Perform an action of this kind."""
@@ -232,7 +232,7 @@ def soak(
 
 def _cancel_jobs(url: str) -> None:
     """Cancel the jobs, which would otherwise continue for an hour without a tab."""
-    with suppress(ConnectionClosed, TimeoutError), RawTab(url, draws=True, keep=1, key="cancel") as tab:
+    with suppress(ConnectionClosed, TimeoutError), RawTab(url, keep=1, key="cancel") as tab:
         for _ in range(_MAX_JOBS):
             for element, widget in list(tab.widgets.items()):
                 if widget.get("label") == "Cancel" and widget.get("visible", True):

@@ -60,7 +60,7 @@ def slider(trace: Trace, recording: Path) -> list[str]:
     """Move the first joint's slider over a web socket, and wait for the overlay."""
     with ViewerApp.open(recording, port=0) as app:
         app.wait_until_shown(120)
-        with RawTab(app.url, draws=True) as tab:
+        with RawTab(app.url) as tab:
             element = app.page.element_id(app.view.layout.joints.slider(app.scene.arms[0].name, 0))
             app.wait_until_shown(120)
             time.sleep(_SETTLE)
