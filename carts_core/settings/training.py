@@ -367,7 +367,7 @@ ADAPTATION_SETTINGS = TrainingConfig(
 
 
 BaselineName = Literal["unet", "hrnet", "swin", "efficientnet", "colleoni"]
-"""Baseline network. All use only the image, except Colleoni's network, which also uses a rendering of the kinematics."""
+"""Baseline network. Colleoni's network also uses a rendering of the kinematics, the others only the image."""
 Augmentation = Literal["none", "smoke", "autoaugment", "elastic", "projective"]
 """Augmentation of training images in addition to mirroring: simulated smoke (as in the paper), or an augmentation
 compared by SegSTRONG-C."""

@@ -1,6 +1,7 @@
 """Baseline networks and their weights files.
 
-The networks are a U-Net, encoders from timm (HRNet, Swin, EfficientNet) with a U-Net decoder, and Colleoni's network with two encoders.
+The networks are a U-Net, encoders of timm (HRNet, Swin, EfficientNet) with a U-Net decoder, and Colleoni's network with
+two encoders.
 """
 
 import hashlib

@@ -51,7 +51,11 @@ class _Frames(TrainingFrames):
 
 
 @pytest.mark.parametrize(
-    "name", ["colleoni", *(pytest.param(name, marks=pytest.mark.slow) for name in ("unet", "hrnet", "swin", "efficientnet"))]
+    "name",
+    [
+        "colleoni",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("unet", "hrnet", "swin", "efficientnet")),
+    ],
 )
 def test_networks_train_save_and_load(name: BaselineName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.lab.baselines.training.VALIDATION", 4)
