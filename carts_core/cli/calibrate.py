@@ -278,6 +278,8 @@ class Calibrate:
         known_cameras = [name for name in cameras if prior is not None and name not in prior.free_cameras]
         free = replace(self.free, locked_cameras=tuple(dict.fromkeys((*self.free.locked_cameras, *known_cameras))))
         observer.check(sequence, indices, cameras, [self.domain])
+        if known_cameras and free.extrinsics:
+            console.print(f"fixed, since known before `carts hand-eye`: the pose of {', '.join(known_cameras)}")
         with (
             message_if_stopped(f"nothing was written to {output}"),
             published(output, overwrite=self.overwrite) as folder,

@@ -300,7 +300,9 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
         given = ["--points", str(tmp_path / f"{name}.csv"), "--pixel-error", "0.5"]
         main(["hand-eye", str(path), *given, "--output", str(tmp_path / name)])
     refine = ["--observe", "masks", "--frames", "all"]
+    capsys.readouterr()
     main(["calibrate", str(tmp_path / "right/sequence.toml"), *refine, "--output", str(tmp_path / "refined")])
+    assert "fixed, since known before `carts hand-eye`: the pose of left, right" in capsys.readouterr().out
     refined = Sequence.open(tmp_path / "refined/sequence.toml").scene
     for before, after in zip(sequence.scene.cameras, refined.cameras, strict=True):
         assert np.allclose(before.T_camera_world, after.T_camera_world, atol=1e-9)
