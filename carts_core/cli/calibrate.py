@@ -273,7 +273,7 @@ class Calibrate:
         print_hints(console, blank_hint(", ".join(cameras), chosen, indices))
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
-        prior = read_prior(sequence)
+        prior = read_prior(sequence.path, sequence.scene)
         # Cameras whose poses were known before the hand-eye calibration are locked.
         known_cameras = [name for name in cameras if prior is not None and name not in prior.free_cameras]
         free = replace(self.free, locked_cameras=tuple(dict.fromkeys((*self.free.locked_cameras, *known_cameras))))

@@ -15,6 +15,7 @@ from typing import Any
 from carts_core.errors import CartsError
 from carts_core.files.reading import VALUES, parse_json, read_text
 from carts_core.model.scene import Scene
+from carts_core.optimization.hand_eye import read_prior
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,
@@ -115,7 +116,17 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     measured = session.measured(state.frame)
     ignored = tuple(session.ignored(index, cameras, target) for index in indices)
     scene = scene_at(session.scene, measured)
-    task = CalibrationTask(sequence, tuple(indices), state.domain, Calibration.of(scene), free, target, ignored)
+    prior = read_prior(sequence.path, scene)
+    task = CalibrationTask(
+        sequence,
+        tuple(indices),
+        state.domain,
+        Calibration.of(scene),
+        free,
+        target,
+        ignored,
+        known_base_frames={} if prior is None else prior.base_covariances,
+    )
     most, made_by, result = CALIBRATION_SETTINGS.iterations, None, None
     with closing(optimizers.calibration(task)) as steps:
         while (found := (yield from steps.next())) is not None:
@@ -145,6 +156,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     again = " All masks have changed: run or solve fitted frames again." if solved else ""
     again += f" Accepted frames that became unreviewed: {accepted}." if accepted else ""
     done = f"Calibrated on {len(indices)} frames, one undo step.{result.moved}"
+    if result.beyond:
+        verdict += f" {result.beyond[:1].upper()}{result.beyond[1:]} Undo it, or check the clicked points."
     yield Progress(most, most, f"{done} {verdict}{again}")
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from viewer_desk import Desk
 from viewer_tab import OpenViewer, place_of, view_of, widget
@@ -192,6 +193,22 @@ def test_a_calibration_is_a_job_and_one_step_of_undo_and_says_what_it_does_to_ac
     assert "Accepted frames that became unreviewed: 1." in job.text and "solve fitted frames again" in job.text
     steps = [step.name for step in desk.saved.steps]
     assert steps[1:] == ["Calibrate on 2 frames"]
+
+
+def test_a_calibration_starts_with_what_the_clicked_points_left_open(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm, covariance = desk.session.scene.arms[0], np.diag([1e-3] * 3 + [1e-4] * 3)
+    pose = {"T_world_base": arm.T_world_base.tolist(), "covariance": covariance.tolist()}
+    path = desk.session.sequence.path.with_name("hand_eye.json")
+    path.write_text(json.dumps({"free_cameras": [], "base_frames": {arm.name: pose}}))
+    tasks, calibration = [], desk.factory.calibration
+    monkeypatch.setattr(desk.factory, "calibration", lambda task: (tasks.append(task), calibration(task))[1])
+    desk.do(intents.Calibrate(2), intents.Calibrate(1))
+    desk.finish()
+    # The second one starts from other base frames than those of the points.
+    assert [list(task.known_base_frames) for task in tasks] == [[arm.name], []]
+    assert np.array_equal(tasks[0].known_base_frames[arm.name], covariance)
 
 
 def test_a_job_that_cannot_be_done_has_failed_and_the_next_one_is_begun(desk: Desk) -> None:

@@ -70,14 +70,18 @@ class HandEyePrior:
     """Cameras whose pose was unknown before the hand-eye calibration."""
 
 
-def read_prior(sequence: Sequence) -> HandEyePrior | None:
+def read_prior(sequence: Path, scene: Scene) -> HandEyePrior | None:
     """Read the uncertainty of the hand-eye calibration that wrote a sequence file; None without a hand-eye calibration
     or if base frames have changed since.
+
+    Args:
+        sequence: path of the sequence file.
+        scene: scene with the current base frames.
 
     Raises:
         SettingsError: `hand_eye.json` beside the sequence file cannot be read.
     """
-    path = sequence.path.parent / RESULT_FILE
+    path = sequence.parent / RESULT_FILE
     if not path.is_file():
         return None
     try:
@@ -97,7 +101,7 @@ def read_prior(sequence: Sequence) -> HandEyePrior | None:
         raise SettingsError(
             f"{path} has no valid covariances of base frames. Run carts hand-eye again, or remove the file."
         )
-    now = {arm.name: arm.T_world_base for arm in sequence.scene.arms}
+    now = {arm.name: arm.T_world_base for arm in scene.arms}
     if not all(name in now and np.allclose(now[name], T, atol=1e-6) for name, T in known.items()):
         return None
     return HandEyePrior(covariances, free)
