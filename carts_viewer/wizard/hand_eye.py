@@ -1,5 +1,6 @@
 """The Hand-eye step of New recording: clicked points, calibration, and saving."""
 
+import json
 import math
 import threading
 from collections import deque
@@ -14,7 +15,7 @@ import numpy as np
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
 from carts_core.optimization import StopReason
-from carts_core.optimization.hand_eye import HandEyeResult
+from carts_core.optimization.hand_eye import RESULT_FILE, HandEyeResult
 from carts_core.recording import Sequence, evenly_spaced
 from carts_core.recording.importing.delays import open_recording
 from carts_core.recording.importing.found import FoundRecording
@@ -312,16 +313,17 @@ class HandEyeStep:
         if self._running():
             raise SettingsError("the calibration is still running. Stop it, or wait until it ends.")
         folder = target_folder(self._host.roots, Path(draft.source), draft.name)
-        count = len(draft.points)
+        count, files = len(draft.points), {}
         if draft.calibration is not None:
             text = f"{count} points clicked in carts view, and a calibration on {CALIBRATION_FRAMES} frames"
             calibration = draft.calibration
         elif self._clicking.result is not None:
             text, calibration = f"{count} points clicked in carts view", self._plain(self._clicking.scene)
+            files[RESULT_FILE] = json.dumps(self._clicking.content, indent=1)
         else:
             return write_sequence(replace(self._recording, name=draft.name), folder)
         recording = calibrated_recording(self._recording, self._sequence.scene, calibration, text)
-        return write_sequence(replace(recording, name=draft.name), folder)
+        return write_sequence(replace(recording, name=draft.name), folder, files=files)
 
     def _solve(self, draft: Draft) -> None:
         wanted = (draft.points, draft.focal_length)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from carts_core.optimization.hand_eye import (
     ImagePoint,
     mounts_of_points,
     moved_cameras,
+    result_json,
     solve_hand_eye,
 )
 from carts_core.optimization.hand_eye.files import STATIONARY_TOLERANCE
@@ -55,6 +57,7 @@ class Clicking:
         frames: frames with the same camera poses, for prompts.
         plan: all prompts, in order.
         result: calibration from the points; None if there are too few points.
+        content: the result as `carts hand-eye` writes it; empty without a result.
         problem: cause of a missing result.
     """
 
@@ -63,6 +66,7 @@ class Clicking:
         self.frames = _stationary(sequence)
         self.plan = _plan(sequence, self.frames)
         self.result: HandEyeResult | None = None
+        self.content: dict[str, Any] = {}
         self.problem = ""
         self._settings = HandEyeSettings(focal_length=focal_length, free_cameras=unknown_cameras(sequence.scene))
 
@@ -89,11 +93,13 @@ class Clicking:
 
     def solve(self, points: Rows[ImagePoint]) -> None:
         """Compute the calibration from the points, which must be in frames with the same camera poses."""
-        self.result, self.problem = None, ""
+        self.result, self.content, self.problem = None, {}, ""
         try:
             mounts = mounts_of_points(self.sequence, points)
             scene = moved_cameras(self.sequence.scene, mounts)
             result = solve_hand_eye(scene, self.sequence.measured, points, self._settings)
+            # Written poses of arms in cameras are those at the time of the points.
+            self.content = result_json(self.sequence, points, result, self._settings.free_cameras)
             self.result = replace(result, scene=moved_cameras(result.scene, mounts, back=True))
         except CartsError as error:
             self.problem = str(error)

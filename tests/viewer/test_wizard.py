@@ -31,7 +31,7 @@ from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import ImagePredictor, StopReason
-from carts_core.optimization.hand_eye import ImagePoint, PoseDeviation
+from carts_core.optimization.hand_eye import ImagePoint, PoseDeviation, read_prior
 from carts_core.recording import Sequence
 from carts_core.recording.importing.delays import open_recording
 from carts_core.rendering import Renderer
@@ -246,7 +246,8 @@ def test_an_arm_without_points_keeps_its_placeholder_pose_and_its_note(tmp_path:
         site.post(lambda: place.choose("save", ""))
         app = eventually(lambda: site.app, lambda now: now is not None)
         assert app is not None
-        text = app.sequence.path.read_text()
+        text, prior = app.sequence.path.read_text(), read_prior(app.sequence.path, app.sequence.scene)
+    assert prior is not None and list(prior.base_covariances) == ["PSM1"]
     assert text.count("Base frame: 16 points clicked in carts view.") == 1
     assert text.count("Base frame: a placeholder in front of the camera.") == 1
     assert "PSM2: no base frame" in text and "PSM1: no base frame" not in text and "no calibration" not in text

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -232,8 +233,11 @@ MOTION = "endoscope.csv"
 _HANDLE = "frame"
 
 
-def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool = False) -> Path:
-    """Atomically write FOLDER/sequence.toml and its tables; returns the sequence file. Images are not copied."""
+def write_sequence(
+    recording: FoundRecording, folder: Path, *, overwrite: bool = False, files: Mapping[str, str] | None = None
+) -> Path:
+    """Atomically write FOLDER/sequence.toml, its tables and further `files`; returns the sequence file. Images are not
+    copied."""
     with TemporaryDirectory() as trial:
         _write(recording, Path(trial), Path(trial))
         try:
@@ -249,6 +253,8 @@ def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool =
             raise SequenceError(text.replace(f"{trial}/", "")) from error
     with published(folder, overwrite=overwrite) as draft:
         _write(recording, draft, folder.absolute())
+        for name, text in (files or {}).items():
+            write_text(draft / name, text)
         write_text(draft / MARKER, json.dumps({"format": "sequence", "source": recording.kind}))
     return folder / "sequence.toml"
 
