@@ -434,10 +434,12 @@ class TransferHandler(Handler):
 
         self._import = _threads().submit(read)
         self._running[self._import] = lambda found: self._apply(found, path.name, replace=intent.replace)
-        self._context.change(importing=0, error=None)
+        self._context.change(importing=0, error=None, notice=None)
 
     def _on_CancelImport(self, intent: intents.CancelImport) -> None:
-        self.cancel()
+        if self._context.state.importing is not None:
+            self.cancel()
+            self._context.change(notice="Import cancelled; the project is unchanged.")
 
     def _counted(self, frames: Iterator[T], cancelled: threading.Event) -> Iterator[T]:
         for frame in frames:

@@ -118,7 +118,7 @@ class ExportPanel:
 
 _BY_NAME = "By name"
 _HINT = (
-    "Path in the recording's folder: a file of COCO, LabelMe or Label Studio (.json), CVAT (.xml) or SurgPose, or a "
+    "A file of COCO, LabelMe or Label Studio (.json), CVAT (.xml) or SurgPose, or a "
     "folder of LabelMe files, YOLO labels or mask images"
 )
 _BY_CONTENT = "By content"
@@ -135,7 +135,9 @@ class ImportPanel:
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         cameras = [camera.name for camera in session.scene.cameras]
+        folder = escaped(str(session.sequence.path.parent.absolute()))
         with gui.add_folder("Import", expand_by_default=False):
+            gui.add_html(f'<p class="carts-caption">A path relative to <code>{folder}</code>, or an absolute path.</p>')
             self._path = gui.add_text("From", "", hint=_HINT)
             self._camera = gui.add_dropdown(
                 "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Camera whose images were annotated"

@@ -299,6 +299,7 @@ def test_an_import_holds_up_no_other_tab_and_can_be_cancelled(
         eventually(lambda: mine.state.importing, lambda count: count is None)
         goes_on.set()
         assert not app.wait_until_shown().project.steps and mine.state.error is None
+        assert mine.state.notice == "Import cancelled; the project is unchanged."
         press("Import masks")
         eventually(lambda: mine.state.imported, lambda text: "Imported 2 masks" in text)
 
