@@ -93,7 +93,7 @@
 
   window.addEventListener("click", (event) => {
     const button = event.target instanceof Element ? event.target.closest("button[data-upload]") : null;
-    if (button?.dataset.upload === "cancel") running?.close(1000, "Upload cancelled.");
+    if (button?.dataset.upload === "cancel") running?.close(1000, "Upload cancelled. Incomplete uploads are not kept.");
     else if (button) choose(button.dataset.upload === "folder");
   });
   for (const kind of ["dragover", "dragleave", "drop"]) {
