@@ -96,7 +96,7 @@
     if (!on && waiting) showDocument(...waiting);
   }
 
-  /** Replace the content; focus, text being typed and scroll positions are kept. */
+  /** Replace the content; focus, text being typed and scroll positions are kept, and a new `data-reveal` is scrolled to. */
   function showDocument(content, place) {
     const target = element();
     waiting = held ? [content, place] : null;
@@ -111,6 +111,7 @@
     target.className = content ? `carts-document carts-document-${place}` : "";
     target.hidden = !content;
     const top = target.scrollTop;
+    const revealed = Boolean(target.querySelector("[data-reveal]"));
     const nodes = built(content);
     restored = null;
     replacing = true;
@@ -132,6 +133,7 @@
         restored = again;
       }
     }
+    if (!revealed) target.querySelector("[data-reveal]")?.scrollIntoView({ block: "nearest" });
     document.documentElement.classList.toggle("carts-documented", Boolean(content));
     const covered = Boolean(content) && place === "page";
     document.documentElement.classList.toggle("carts-covered", covered);

@@ -277,6 +277,21 @@ def test_a_folder_whose_name_has_a_format_character_can_be_chosen(tmp_path: Path
         assert 'role="alert"' not in site.document.content and "This folder is empty." in site.document.content
 
 
+@pytest.mark.browser
+def test_the_file_browser_is_scrolled_into_view_when_it_opens(site: Site, tmp_path: Path, browser: Browser) -> None:
+    (tmp_path / "labs" / "day 3").mkdir()
+    with site, closing(new_context(browser, (1280, 640))) as context:
+        page = context.new_page()
+        page.goto(site.url)
+        opened = page.get_by_role("button", name="Open a sequence file …")
+        opened.evaluate("button => button.click()")  # without the scrolling of Playwright
+        expect(page.get_by_label("File browser")).to_be_in_viewport(ratio=0.99)
+        page.locator("main").evaluate("main => main.scrollTo(0, 0)")
+        page.get_by_role("button", name="day 3/").evaluate("button => button.click()")
+        expect(page.get_by_text("This folder is empty.")).to_be_attached()
+        assert page.locator("main").evaluate("main => main.scrollTop") == 0
+
+
 def test_what_is_foreign_is_escaped_in_documents() -> None:
     nasty = "<img src=x onerror=alert(1)>\"'&"
     for text in (escaped(nasty), render("message.html", title=nasty, text=nasty)):
