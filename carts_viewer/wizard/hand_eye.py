@@ -41,7 +41,7 @@ from carts_viewer.wizard.calibration import (
     report_of,
     target_folder,
 )
-from carts_viewer.wizard.draft import ClickedPoint, Draft
+from carts_viewer.wizard.draft import ClickedPoint, Draft, Step
 from carts_viewer.wizard.drawing import Drawing, drawing_of
 from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras
 
@@ -109,6 +109,7 @@ def hand_eye_panel(
         deviations = {(pose.arm, pose.camera): pose.deviation for pose in report.poses}
     return render(
         "hand_eye.html",
+        steps=Step,
         draft=draft,
         clicking=clicking,
         prompt=prompt,
