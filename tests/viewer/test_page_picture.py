@@ -198,8 +198,9 @@ def test_sliders_keypoints_and_links_are_dragged_and_each_drag_is_one_step(open_
     hand = Hand(tab)
     keyboard.down("Shift")
     mouse.click(*hand.at(150.0, 110.0))
-    eventually(lambda: app.state, lambda state: state.undoable == 1 and not state.unsaved)
-    (pin,) = app.state.keypoints.pins
+    (pin,) = eventually(lambda: app.state.keypoints.pins, lambda pins: len(pins) == 1)
+    eventually(lambda: not app.state.unsaved)
+    assert app.state.undoable == 1, "the slider was undone"
     # A screen pixel is less than half an image pixel here.
     assert pin.pixel == pytest.approx((150.0, 110.0), abs=1.0) and app.state.keypoints.residuals[0] < 1.0
     keyboard.up("Shift")
