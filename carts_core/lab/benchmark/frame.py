@@ -28,8 +28,11 @@ from ...optimization import (
     FrameOptimizer,
     FreeParameters,
     MaskPredictor,
+    MaskRefiner,
+    NetworkPredictor,
     SequenceOptimizer,
     SurfaceSolver,
+    Verdict,
 )
 from ...optimization.results import Uncertainty
 from ...recording import Frame
@@ -334,9 +337,15 @@ class SourceBench:
         trace, best, seconds = _followed(optimizer, truth, renderer, time.perf_counter() - began)
         end = optimizer.best
         assert end is not None and optimizer.stop_reason is not None
+        final = truth.score(end.state, renderer, seconds, end.uncertainty, end.loss)
+        if method.refined and optimizer.assessment is not None and optimizer.assessment.verdict is Verdict.GOOD:
+            refiner = MaskRefiner(NetworkPredictor(self._extractor), backgrounds)
+            rendered = {camera: renderer.segment(end.state.to("cpu"))[0] >= 0}
+            refined = refiner.refine(scene, frame, end.state, rendered)[camera]
+            final = truth.score_mask(refined, time.perf_counter() - began)
         return Measurement(
             run,
-            truth.score(end.state, renderer, seconds, end.uncertainty, end.loss),
+            final,
             optimizer.stop_reason,
             machine(networks.device),
             tuple(trace),

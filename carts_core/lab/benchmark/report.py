@@ -30,7 +30,7 @@ matplotlib.rcParams["svg.hashsalt"] = "carts"
 
 COLORS = {"paper": "#b3541e", "ours": "#1f5fa8"}
 _PAPERS_TABLES = ("dice", "dice_by_iterations", "dice_by_error", "mae_by_error")
-_BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8")
+_BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8", "#7fb2e5")
 
 
 def write_figures(data: Measurements, folder: OutputPath) -> dict[str, Path]:
@@ -60,19 +60,19 @@ def _domains(data: Measurements) -> Figure | None:
         lowest = 1.0
         for number, (label, method, steps) in enumerate(ROWS):
             found = {
-                index + 0.13 * (number - 2.5): np.array([score.dice for score in chosen])
+                index + 0.12 * (number - 3): np.array([score.dice for score in chosen])
                 for index, domain in enumerate(domains)
                 if (chosen := scores(data.of(source=source, domain=domain, method=method, error_deg=None), steps))
             }
             means, deviations = [dice.mean() for dice in found.values()], [dice.std() for dice in found.values()]
-            axes.bar(list(found), means, 0.12, color=_BARS[number], label=label)
+            axes.bar(list(found), means, 0.11, color=_BARS[number], label=label)
             axes.errorbar(list(found), means, deviations, fmt="none", color="#333", lw=1)
             lowest = min([lowest, *(mean - deviation for mean, deviation in zip(means, deviations, strict=True))])
         axes.set_xticks(range(len(domains)), [DOMAIN_LABELS[domain] for domain in domains])
         axes.set(title=f"{source} frames", ylabel="Dice", ylim=(max(0.0, np.floor(10 * lowest - 0.5) / 10), 1.0))
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     return figure
 
 

@@ -143,6 +143,8 @@ class Method:
     """Whether base frames come from one calibration of the whole recording."""
     as_sequence: bool = False
     """Whether frames are corrected together, as a sequence."""
+    refined: bool = False
+    """Whether masks of good results are refined, as in exports."""
     masks_given: bool = False
     """Whether given masks are fitted, without a network."""
     baseline: bool = False
@@ -167,6 +169,7 @@ METHODS = {
     "paper": Method("CaRTS ACS (paper's setting)", DescentSolver.paper),
     "acs": Method("CaRTS ACS, our schedule", lambda _: DescentSolver()),
     "ours": Method("CaRTS, ours", _ours),
+    "ours_refined": Method("CaRTS, ours, refined masks", _ours, refined=True),
     "ours_given": Method("ours, occluder given", _ours, occluders_given=True),
     "ours_proposed": Method("ours, ignore mask proposed", lambda _: solver(SolverName.OCCLUDED)),
     "stereo": Method("ours, all cameras", _ours, every_camera=True),
@@ -201,7 +204,7 @@ BASELINES = {
 }
 """Networks from the literature, by network and augmentation; measured if weights are given."""
 METHODS |= BASELINES
-MAIN = ("unet", "start", "l1", "paper", "ours")
+MAIN = ("unet", "start", "l1", "paper", "ours", "ours_refined")
 """Methods of the main table, which treat each frame separately in one camera."""
 RENDERING = "surface"
 """Method whose mask is predicted by the surface network from the image and the rendering at the measured joint

@@ -54,6 +54,7 @@ ROWS = (
     ("CaRTS ACS, paper's setting, best of 30", "paper", 30),
     ("CaRTS ACS, paper's setting, best of 50", "paper", 50),
     ("CaRTS, ours", "ours", None),
+    ("CaRTS, ours, refined masks", "ours_refined", None),
 )
 """Label, method and number of steps of the main table's rows."""
 

@@ -15,7 +15,7 @@ from carts_core.lab.benchmark.conditions import NO_ARM, OTHER_INSTRUMENT, WRONG
 from carts_core.lab.benchmark.frame import SourceBench
 
 QUIET = Console(quiet=True)
-RUNS = 38
+RUNS = 40
 """10 of the main table, 2 of the surface network alone, 2 with an error at the start, 4 with something wrong, 6 with
 occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode, 4 of TC-CaRTS."""
 
@@ -73,6 +73,13 @@ def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_furt
         assert measurement.final.seconds > 0
         if measurement.run.error_deg and measurement.start:
             assert measurement.start.joint_mae_deg == pytest.approx(2.0, abs=1e-3)
+    rendered = {m.run: m for m in measurements}
+    for refined in (m for m in measurements if m.run.method == "ours_refined"):
+        ours = rendered[replace(refined.run, method="ours")]
+        assert refined.verdict == ours.verdict
+        # A refined mask belongs to no kinematics.
+        assert (refined.final.joint_mae_deg is None) is (refined.verdict == "good")
+        assert refined.verdict == "good" or refined.final.dice == ours.final.dice
     temporal = [m.stopped for m in measurements if m.run.method == "temporal"]
     assert temporal == 2 * ["cold", "warm"], "the second frame starts at the first's correction"
     judged = [m for m in measurements if m.run.method in ("ours", "masks", "sequence")]

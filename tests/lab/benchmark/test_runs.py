@@ -20,7 +20,7 @@ from carts_core.model.robot import Robot
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.recording import Sequence
 
-METHODS = ("unet", "start", "l1", "paper", "ours")
+METHODS = ("unet", "start", "l1", "paper", "ours", "ours_refined")
 
 
 def _source(name: str, frames: list[int], cameras: tuple[str, ...] = ("left",)) -> Source:
