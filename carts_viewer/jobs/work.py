@@ -15,7 +15,6 @@ from typing import Any
 from carts_core.errors import CartsError
 from carts_core.files.reading import VALUES, parse_json, read_text
 from carts_core.model.scene import Scene
-from carts_core.optimization.hand_eye import read_prior
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,
@@ -97,6 +96,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
 
     The result is one undo step.
     """
+    from carts_core.optimization.hand_eye import read_prior  # noqa: PLC0415  its import of SciPy takes time
+
     session, state = context.session, context.state
     sequence = session.sequence
     cameras = [camera.name for camera in session.scene.cameras]
