@@ -77,8 +77,8 @@ def test_each_page_from_the_start_to_the_clicked_points(
         check(page, "Hand-eye")
         # A mark is moved by the keyboard, and Escape leaves the file browser.
         page.get_by_role("button", name="tip", exact=True).first.click()
+        page.locator(".mark[aria-label^='wrist ']").wait_for()  # This frame is shown; the one before has a tip only.
         mark, row = page.locator(".mark[aria-label^='tip ']"), 0
-        mark.wait_for()
         before = wizard.draft.points[row].pixel
         mark.focus()
         page.keyboard.press("ArrowRight")
