@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from viewer_desk import Desk
 from viewer_tab import OpenViewer, place_of, view_of, widget
 from waiting import eventually
 
 from carts_core.errors import CartsError
 from carts_core.networks.weights import read_weights, save_weights
-from carts_core.project import ReviewState, Source
+from carts_core.project import CorrectedTransform, Key, Provenance, ReviewState, Source
 from carts_core.project.identity import data_dir
 from carts_core.resources import shipped_weights
 from carts_core.settings import FreeParameters, SolverName, solver
@@ -195,13 +196,19 @@ def test_a_calibration_is_a_job_and_one_step_of_undo_and_says_what_it_does_to_ac
     assert steps[1:] == ["Calibrate on 2 frames"]
 
 
+def write_hand_eye(desk: Desk, T_world_base: np.ndarray, covariance: np.ndarray) -> None:
+    """Write the result of a hand-eye calibration beside the sequence file."""
+    arm = desk.session.scene.arms[0].name
+    pose = {"T_world_base": T_world_base.tolist(), "covariance": covariance.tolist()}
+    text = json.dumps({"free_cameras": [], "base_frames": {arm: pose}})
+    desk.session.sequence.path.with_name("hand_eye.json").write_text(text)
+
+
 def test_a_calibration_starts_with_what_the_clicked_points_left_open(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arm, covariance = desk.session.scene.arms[0], np.diag([1e-3] * 3 + [1e-4] * 3)
-    pose = {"T_world_base": arm.T_world_base.tolist(), "covariance": covariance.tolist()}
-    path = desk.session.sequence.path.with_name("hand_eye.json")
-    path.write_text(json.dumps({"free_cameras": [], "base_frames": {arm.name: pose}}))
+    write_hand_eye(desk, arm.T_world_base, covariance)
     tasks, calibration = [], desk.factory.calibration
     monkeypatch.setattr(desk.factory, "calibration", lambda task: (tasks.append(task), calibration(task))[1])
     desk.do(intents.Calibrate(2), intents.Calibrate(1))
@@ -209,6 +216,21 @@ def test_a_calibration_starts_with_what_the_clicked_points_left_open(
     # The second one starts from other base frames than those of the points.
     assert [list(task.known_base_frames) for task in tasks] == [[arm.name], []]
     assert np.array_equal(tasks[0].known_base_frames[arm.name], covariance)
+    assert all("hand-eye" not in job.text for job in desk.state.jobs)
+
+
+def test_a_calibration_beyond_what_the_clicked_points_left_open_is_said(desk: Desk) -> None:
+    T_world_base = desk.session.scene.arms[0].T_world_base.copy()
+    T_world_base[:3, :3] = T_world_base[:3, :3] @ Rotation.from_rotvec(np.radians([0.0, 9.0, 0.0])).as_matrix()
+    moved = CorrectedTransform(tuple(map(tuple, T_world_base.tolist())), Provenance(Source.HAND))
+    desk.session.editor.apply("Move the base", {Key.base_frame("PSM1"): moved})
+    # As if the points had left nothing open.
+    write_hand_eye(desk, T_world_base, 1e-8 * np.eye(6))
+    desk.do(intents.SetObserved("masks", "recording"), intents.Calibrate(2))
+    desk.finish()
+    (job,) = desk.state.jobs
+    assert job.state is JobState.DONE, job.text
+    assert "moves the base frame of PSM1 by" in job.text and "Undo it, or check the clicked points." in job.text
 
 
 def test_a_job_that_cannot_be_done_has_failed_and_the_next_one_is_begun(desk: Desk) -> None:
